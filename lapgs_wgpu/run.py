@@ -24,9 +24,9 @@ from lapgs_wgpu.progress import Progress, say
 from lapgs_wgpu.stop_signals import stop_requests
 from lapgs_wgpu.train.config import Config, DataConfig
 from lapgs_wgpu.train.evaluate import evaluate, write_metrics
+from lapgs_wgpu.train.host import keep_freed_memory, return_freed_memory
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.lpips import Lpips
-from lapgs_wgpu.train.malloc import keep_freed_memory, return_freed_memory
 from lapgs_wgpu.train.parts import Parts
 from lapgs_wgpu.train.run_folder import (
     STATE,
@@ -254,7 +254,7 @@ def evaluate_run(
     training: dict[str, Any],
     lpips: Lpips | None = None,
 ) -> dict[str, object]:
-    """Evaluate on the test views; write metrics.json, metrics.csv and eval/ of a run folder; returns the metrics.
+    """Evaluate on the test views; write metrics.json and eval/ of a run folder; returns the metrics.
 
     data: says on which background. lpips: as for `evaluate`.
     """

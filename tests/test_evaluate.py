@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import json
 from pathlib import Path
 
 import numpy as np
@@ -90,18 +88,6 @@ def test_background_lies_under_both_sides(scene: Scene4D, background: str, value
     assert evaluate(empty, [view("opaque", opaque)], background)["psnr"] == pytest.approx(100)
 
 
-def test_a_line_for_each_view(scene: Scene4D, tmp_path: Path) -> None:
-    drawn = to_8_bit(scene.render(CAMERA, 0.5).image)
-    metrics = evaluate(scene, [view("a", drawn), view("b", 255 - drawn)], "black")
-    write_metrics(tmp_path, metrics)
-    with (tmp_path / "metrics.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert [row["view"] for row in rows] == ["a", "b"]
-    assert [float(row["psnr"]) for row in rows] == [one["psnr"] for one in metrics["views"]]
-    assert rows[0]["ms_ssim"] == "not available"
-    assert json.loads((tmp_path / "metrics.json").read_text())["ssim"] == metrics["ssim"]
-
-
 def pictures(height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(0)
     a = torch.rand(height, width, 3, generator=generator, dtype=torch.float64)
@@ -139,7 +125,7 @@ def test_ms_ssim_written_out(size: tuple[int, int]) -> None:
     assert MS_SSIM_SMALLEST == 161
 
 
-def test_the_masked_measure_sees_the_pixels_of_the_mask_alone(scene: Scene4D, tmp_path: Path) -> None:
+def test_the_masked_measure_sees_the_pixels_of_the_mask_alone(scene: Scene4D) -> None:
     drawn = to_8_bit(scene.render(CAMERA, 0.5).image)
     mask = np.zeros((16, 24), bool)
     mask[3:14, 5:20] = True
@@ -151,9 +137,6 @@ def test_the_masked_measure_sees_the_pixels_of_the_mask_alone(scene: Scene4D, tm
     assert first["masked_psnr"] == pytest.approx(-10 * np.log10((8 / 255) ** 2 / 3), abs=1e-4)
     assert first["psnr"] > second["psnr"]
     assert first["masked_psnr"] == second["masked_psnr"] == metrics["masked_psnr"]
-    write_metrics(tmp_path, metrics)
-    with (tmp_path / "metrics.csv").open(newline="") as file:
-        assert [float(row["masked_psnr"]) for row in csv.DictReader(file)] == [first["masked_psnr"]] * 2
 
 
 def test_what_moves_is_measured_by_itself_and_drawn_from_beside(scene: Scene4D, tmp_path: Path) -> None:

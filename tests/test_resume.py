@@ -33,7 +33,7 @@ from lapgs_wgpu.io.safe_json_toml import read_toml
 from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.train import run_folder
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.host_threads import step_threads
+from lapgs_wgpu.train.host import step_threads
 from lapgs_wgpu.train.presets import write_toml
 from lapgs_wgpu.train.run_folder import STATE, load_state, save_state
 from lapgs_wgpu.train.trainer import Trainer

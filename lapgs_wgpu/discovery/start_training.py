@@ -11,7 +11,7 @@ from lapgs_wgpu.discovery.discover import discover
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.make_field import check_own
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.host_threads import step_threads, torch_threads
+from lapgs_wgpu.train.host import step_threads, torch_threads
 from lapgs_wgpu.train.parts import Parts
 from lapgs_wgpu.train.setup import set_up
 from lapgs_wgpu.train.trainer import Trainer

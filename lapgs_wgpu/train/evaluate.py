@@ -5,9 +5,7 @@ Both sides are compared as 8-bit pictures: the model of the last step, clamped a
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
 import json
 import time
 from collections.abc import Sequence
@@ -160,15 +158,9 @@ def _mean(name: str, values: list[Any]) -> float | str:
 
 
 def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:
-    """Write metrics.json, and metrics.csv with a line a view. Atomic; InputError where they cannot be written."""
-    columns = ["view", "time", *MEASURES]
-    text = io.StringIO()
-    table = csv.DictWriter(text, columns, lineterminator="\n")
-    table.writeheader()
-    table.writerows(metrics["views"])
-    for name, content in (("metrics.csv", text.getvalue()), ("metrics.json", json.dumps(metrics, indent=1) + "\n")):
-        with atomic_write(folder / name) as file:
-            file.write(content.encode())
+    """Write metrics.json. Atomic; InputError where it cannot be written."""
+    with atomic_write(folder / "metrics.json") as file:
+        file.write((json.dumps(metrics, indent=1) + "\n").encode())
 
 
 def to_8_bit(image: Tensor) -> NDArray[np.uint8]:

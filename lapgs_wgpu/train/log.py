@@ -15,7 +15,6 @@ from typing import Any, BinaryIO, TextIO
 from lapgs_wgpu.errors import InputError, quoted
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.progress import Progress, duration
-from lapgs_wgpu.train.environment import resident_bytes
 from lapgs_wgpu.train.step_result import StepResult
 from lapgs_wgpu.train.trainer import Trainer
 
@@ -26,9 +25,9 @@ _MOST_SECONDS = 1e9  # that a training takes
 class Log:
     """Progress of a training, step by step. A context manager.
 
-    docs/metrics.md describes the lines of log.jsonl. Their entries "timing" and "memory" differ from run to run; all
-    others repeat, except in the first line after a resumption, which averages the steps since then. Evaluations do not
-    count as time of the training.
+    docs/metrics.md describes the lines of log.jsonl. Their entry "timing" differs from run to run; all others repeat,
+    except in the first line after a resumption, which averages the steps since then. Evaluations do not count as time
+    of the training.
 
     Args:
         path: of log.jsonl, which is written anew, or continued after the step `done`.
@@ -71,7 +70,7 @@ class Log:
 
     def after_step(self, trainer: Trainer, result: StepResult, /) -> None:
         """Take in a step that is done; the loss of one that was skipped does not count. A callback of `Trainer`."""
-        self.step(result, len(trainer.scene), lambda: _now(trainer))
+        self.step(result, len(trainer.scene), lambda: _spectrum(trainer))
 
     def step(self, result: StepResult, gaussians: int, now: Callable[[], dict[str, Any]] = dict) -> None:
         """Take in a step that is done. now: further entries of a line, asked only where a line is written."""
@@ -169,12 +168,6 @@ def _continued(path: Path, done: int) -> tuple[BinaryIO, float]:
     return path.open("ab", buffering=0), seconds  # a line is one write, and none waits for a later one to fail
 
 
-def _now(trainer: Trainer) -> dict[str, Any]:
-    """Of the scene after a step: the motion's spectrum where there is one, and memory."""
-    values = trainer.spectrum()
-    spectrum = {name: [round(value, 6) for value in tensor.tolist()] for name, tensor in values.items()}
-    memory = {"host_bytes": resident_bytes(), "device_bytes": trainer.scene.device.allocated_bytes}
-    return {
-        **spectrum,
-        "memory": {name: value for name, value in memory.items() if value is not None},
-    }
+def _spectrum(trainer: Trainer) -> dict[str, Any]:
+    """The motion's spectrum after a step; nothing where there is none."""
+    return {name: [round(value, 6) for value in values.tolist()] for name, values in trainer.spectrum().items()}

@@ -25,7 +25,7 @@ from lapgs_wgpu.train.density_control import DensityControl
 from lapgs_wgpu.train.evaluate import evaluate, mean_psnr
 from lapgs_wgpu.train.exchange_step import ExchangeStep
 from lapgs_wgpu.train.ground_truth import GroundTruth
-from lapgs_wgpu.train.host_threads import step_threads, torch_threads
+from lapgs_wgpu.train.host import step_threads, torch_threads
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.nonfinite import SkipCounter
 from lapgs_wgpu.train.parts import Parts

@@ -22,7 +22,7 @@ from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.pool import BufferPool
-from lapgs_wgpu.train.malloc import keep_freed_memory
+from lapgs_wgpu.train.host import keep_freed_memory
 from lapgs_wgpu.train.trainer import Trainer
 
 MINUTES = float(os.environ.get("LAPGS_SOAK_MINUTES", "0"))
