@@ -229,13 +229,9 @@ def test_a_checkpoint_of_ones_own_field_needs_its_module(dataset: Dataset, devic
     for opened in (lambda: load(path, device), lambda: open_playback(path, device)):
         with pytest.raises(InputError, match=r"own\.ply: the field own needs a module.*load\(path, field=\.\.\.\)"):
             opened()
-    with pytest.raises(InputError, match=r"own\.ply: is of another field than the module Linear") as caught:
-        load(path, device, field=nn.Linear(3, 3))
-    assert "bias is missing in the file, (3,) in the module" in str(caught.value)
-    assert "velocity is (3,) in the file, missing in the module" in str(caught.value)
-    assert "\\" not in str(caught.value)
-    with pytest.raises(InputError, match=r"velocity is \(3,\) in the file, \(4,\) in the module\. Give a module"):
-        load(path, device, field=Drift(4))
+    for module, named in ((nn.Linear(3, 3), "module.bias"), (Drift(4), "module.velocity")):
+        with pytest.raises(InputError, match=rf"own\.ply: is of another field than the module .*{named}"):
+            load(path, device, field=module)
     trainer.scene.field_config = dataclasses.replace(trainer.scene.field_config, kind="mlp")
     with Trainer(configure("mlp"), dataset, device) as other:
         other.save(path)
@@ -288,10 +284,6 @@ def test_buffers_of_ones_own_field_are_kept(dataset: Dataset, device: Device, tm
     assert load_state(tmp_path)["field.module.moving"].tolist() == [True, False, True]
     found = load(tmp_path / "a.ply", device, field=Masked(moving=torch.zeros(3, dtype=torch.bool)))
     assert torch.equal(found.field.module.moving, moving)
-    complex_ = torch.zeros(1, dtype=torch.cfloat)
-    for buffer, what in ((torch.tensor([-torch.inf]), "NaN or infinity"), (complex_, "complex64")):
-        with pytest.raises(InputError, match=f"Masked keeps .*{what} in mask, which checkpoints do not hold"):
-            Trainer(configure(), dataset, device, parts=Parts(field=Masked(mask=buffer)))
 
 
 def test_all_parts_of_a_deformation_are_optional(dataset: Dataset, device: Device) -> None:
@@ -328,15 +320,9 @@ def test_a_field_can_move_the_scene_rigidly(dataset: Dataset, device: Device) ->
     torch.testing.assert_close(both.quats, nn.functional.normalize(half_turn + d_quats, dim=1))
 
 
-def test_modules_that_cannot_be_fields_are_refused() -> None:
-    class Greedy(Drift):
-        def forward(self, means: Tensor, t: float, dynamics: Tensor, speed: float, *rest: float) -> Tensor:
-            return speed * means
-
+def test_a_class_in_place_of_a_module_is_refused() -> None:
     with pytest.raises(InputError, match=r"must be an nn.Module, such as field=Drift\(\) .* got the class Drift"):
         OwnField(Drift)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="the forward of the field Greedy needs speed, which it is not given"):
-        OwnField(Greedy())
 
 
 def test_groups_of_ones_own_field_have_rates_of_their_own(dataset: Dataset, device: Device) -> None:
@@ -360,7 +346,6 @@ def test_groups_of_ones_own_field_have_rates_of_their_own(dataset: Dataset, devi
         {"means": [module.velocity]},  # a group of the training's own
         {},  # lacks velocity
         {"mlp": [module.velocity], "hash": [module.velocity]},
-        [{"params": [module.velocity], "lr": 1e-3}],  # as optimizers take them
     )
     for groups in impossible:
         module.parameter_groups = lambda groups=groups: groups  # type: ignore[method-assign]
@@ -378,11 +363,7 @@ def test_a_scene_to_start_from_keeps_its_field(dataset: Dataset, device: Device)
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
-        ({"losses": TorchLoss("mine", lambda image, truth: image.mean())}, "losses=...) must be a list, got a T"),
-        ({"losses": [TorchLoss("mine", lambda image: image)]}, "the loss 'mine' is called with (image, truth), which"),
-        ({"callbacks": print}, "callbacks=...) must be a list"),
-        ({"callbacks": [lambda result: None]}, "a callback is called with (trainer, result), which it does not take"),
-        ({"density": lambda: None}, "the rule of density control is called with (state), which it does not take"),
+        ({"losses": [len]}, "losses=...) must list Regularizer and TorchLoss, got a builtin"),
         ({"rates": {"mlp": (1e-2, 1e-3)}}, "gives mlp the rate (0.01, 0.001); give a number of at least 0, or a Rate("),
     ],
 )
@@ -399,8 +380,6 @@ def test_arguments_of_another_kind_are_refused(dataset: Dataset, device: Device)
         Trainer(configure(), "runs/synthetic", device)  # type: ignore[arg-type]
     with Trainer(configure(), dataset, device) as trainer:
         view = dataset.test[0]
-        with pytest.raises(InputError, match=r"a Camera, such as view\.camera, got a View"):
-            trainer.scene.render(view, 0.5)  # type: ignore[arg-type]
         listed, tensor = ([0.25, 0.5, 1], torch.tensor([0.25, 0.5, 1]))
         images = [trainer.scene.render(view.camera, 0.5, background=each).image for each in (listed, tensor)]
         assert torch.equal(*images)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.checkpoint import write_checkpoint
 from lapgs_wgpu.io.ply import GaussianSnapshot
 from lapgs_wgpu.motion.fields.config import MIN_SCALE, FieldConfig
-from lapgs_wgpu.motion.fields.deformation import Deformation, Nearby, TimeSamples
+from lapgs_wgpu.motion.fields.deformation import Deformation, Deformed, Nearby, TimeSamples
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion
 from lapgs_wgpu.motion.fields.make_field import Field, check_own, make_field
@@ -27,20 +27,6 @@ from lapgs_wgpu.splat.constants import CONSTANTS
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import Rendering, rasterize
 from lapgs_wgpu.splat.rotation import quat_multiply
-
-
-class Deformed(NamedTuple):
-    """Gaussians at a time.
-
-    Attributes:
-        gaussians: activated.
-        smoothness: the weighted smoothness loss, if it was asked for.
-        at_times: means (M, 3) and scales (M, 3) of chosen Gaussians at each further time that was asked for.
-    """
-
-    gaussians: Gaussians[Tensor]
-    smoothness: Tensor | None
-    at_times: list[tuple[Tensor, Tensor]]
 
 
 def isotropic_rows(
@@ -256,7 +242,7 @@ class Scene4D:
         depth: bool = True,
         timing: Timing | None = None,
     ) -> Rendering:
-        """Render the scene on the CPU, without gradients. Raises InputError where the camera is none.
+        """Render the scene on the CPU, without gradients.
 
         Args:
             camera: which renders the image.
@@ -265,8 +251,6 @@ class Scene4D:
             depth: whether to render depth, see `rasterize`.
             timing: takes the place of the scene's, as in `at`; None for the scene's.
         """
-        if not isinstance(camera, Camera):
-            raise InputError(f"render takes a Camera, such as view.camera, got a {type(camera).__name__}.")
         if background is not None:
             background = torch.as_tensor(background, dtype=torch.float32)
         with torch.no_grad():
@@ -345,9 +329,14 @@ def scene_of(file: SceneFile, device: Device | None = None, own_field: nn.Module
             antialiased=file.antialiased,
             own_field=own_field,
         )
-        if scene.field is not None:  # a field of one's own checks the shapes; those of the others were checked
+        if scene.field is not None:
             scene.field.load_state_dict({name: torch.from_numpy(array) for name, array in file.field.items()})
     except InputError as error:
         raise InputError(f"{file.path}: {error}") from error
+    except RuntimeError as error:  # torch's, of a field of one's own: the shapes of the others were checked
+        raise InputError(
+            f"{file.path}: is of another field than the module {type(own_field).__name__} that was given; give one of "
+            f"the class and the sizes that it was trained with ({' '.join(str(error).split())})."
+        ) from error
     scene.timing, scene.metadata = file.timing, file.metadata
     return scene

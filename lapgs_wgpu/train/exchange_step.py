@@ -10,9 +10,9 @@ from typing import NamedTuple
 from torch import Tensor
 
 from lapgs_wgpu.data.views import Dataset, View
-from lapgs_wgpu.motion.fields.deformation import Nearby, TimeSamples
+from lapgs_wgpu.motion.fields.deformation import Deformed, Nearby, TimeSamples
 from lapgs_wgpu.motion.fields.dynamics import dynamics_loss
-from lapgs_wgpu.motion.scene import Deformed, Scene4D
+from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.density_control import DensityControl
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss

@@ -11,8 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lapgs_wgpu.motion.fields.deformation import Nearby, TimeSamples
-from lapgs_wgpu.motion.scene import Deformed
+from lapgs_wgpu.motion.fields.deformation import Deformed, Nearby, TimeSamples
 from lapgs_wgpu.train.config import AccelerationConfig, SmoothnessConfig
 
 WOBBLE = 1e-2  # world units: distances far below it count as they are, those far above it all as much as it

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import inspect
 import math
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -15,7 +14,7 @@ from torch import nn
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.train.densify import DensityRule, published_rule
 from lapgs_wgpu.train.learning_rate import Rate
-from lapgs_wgpu.train.loss_terms import TAKEN_NAMES, LossTerm, Regularizer
+from lapgs_wgpu.train.loss_terms import TAKEN_NAMES, LossTerm
 from lapgs_wgpu.train.optimizer import FrequencyOptimizer
 from lapgs_wgpu.train.step_result import StepResult
 
@@ -39,7 +38,7 @@ class Parts:
         callbacks: called after each step, in this order.
 
     Raises:
-        InputError: a part is of another kind, or cannot be called as it will be.
+        InputError: a loss or a rate is of another kind, or two losses have one name.
     """
 
     field: nn.Module | None = None
@@ -49,10 +48,7 @@ class Parts:
     callbacks: Sequence[Callback] = ()
 
     def __post_init__(self) -> None:
-        """Raises InputError for parts of another kind."""
-        for name, values in (("losses", self.losses), ("callbacks", self.callbacks)):
-            if not isinstance(values, Sequence):
-                raise InputError(f"Parts({name}=...) must be a list, got a {type(values).__name__}.")
+        """Raises InputError for losses and rates of another kind."""
         names = Counter(TAKEN_NAMES)
         for term in self.losses:
             if not isinstance(term, LossTerm):
@@ -60,11 +56,6 @@ class Parts:
             names[term.name] += 1
             if names[term.name] > 1:
                 raise InputError(f"there are two loss terms named {term.name!r}; give each a name of its own.")
-            arguments = "scene, gaussians, t" if isinstance(term, Regularizer) else "image, truth"
-            _check_call(term.function, f"the function of the loss {term.name!r}", arguments)
-        for callback in self.callbacks:
-            _check_call(callback, "a callback", "trainer, result")
-        _check_call(self.density, "the rule of density control", "state")
         for name, rate in self.rates.items():
             number = isinstance(rate, int | float) and 0 <= rate < math.inf
             if not number and not isinstance(rate, Rate):
@@ -100,17 +91,3 @@ class Parts:
                 known = ", ".join([*gaussians, *groups])
                 raise InputError(f"Parts(rates=...) names {name}, which is no group of parameters; there are {known}.")
         return rates
-
-
-def _check_call(function: Callable[..., object], what: str, given: str) -> None:
-    """Raises InputError where a function cannot be called with what it is given, a list of names."""
-    if not callable(function):
-        raise InputError(f"{what} must be a function of {given}, got a {type(function).__name__}.")
-    try:
-        takes = inspect.signature(function)
-    except ValueError:  # of a built-in that does not tell
-        return
-    try:
-        takes.bind(*given.split(", "))
-    except TypeError as error:
-        raise InputError(f"{what} is called with ({given}), which it does not take: {error}.") from None

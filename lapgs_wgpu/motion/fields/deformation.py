@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rotation import rotate
 
 
@@ -69,3 +70,17 @@ class Deformation(NamedTuple):
         if self.rotation is not None:
             means = rotate(self.rotation, means)
         return means if self.translation is None else means + self.translation
+
+
+class Deformed(NamedTuple):
+    """Gaussians at a time.
+
+    Attributes:
+        gaussians: activated.
+        smoothness: the weighted smoothness loss, if it was asked for.
+        at_times: means (M, 3) and scales (M, 3) of chosen Gaussians at each further time that was asked for.
+    """
+
+    gaussians: Gaussians[Tensor]
+    smoothness: Tensor | None
+    at_times: list[tuple[Tensor, Tensor]]

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections import Counter
-from collections.abc import Mapping
-from typing import Any
 
-import torch
 from torch import Tensor, nn
 
 from lapgs_wgpu.errors import InputError
@@ -17,11 +14,6 @@ _ROWS = {
     "rotation": (4,), "orientation": (4,), "translation": (3,), "d_quats": (4,), "d_scales": (3,), "d_dc": (3,),
     "d_opacity": (),
 }  # fmt: skip
-_STORED = (
-    torch.float64, torch.float32, torch.float16, torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8,
-    torch.bool,
-)  # fmt: skip
-_OPTIONAL = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
 
 class OwnField(nn.Module):
@@ -29,7 +21,7 @@ class OwnField(nn.Module):
 
     module: called as module(means, t), with the arguments dynamics and nearby where its forward names them. It returns
     a translation (N, 3), or a Deformation. Its method parameter_groups(), if it has one, returns its parameters by
-    learning rate; without it all of them learn at the rate "mlp". Raises InputError for what cannot be called so.
+    learning rate; without it all of them learn at the rate "mlp". Raises InputError for what is no module.
     """
 
     def __init__(self, module: nn.Module) -> None:
@@ -38,22 +30,8 @@ class OwnField(nn.Module):
             given = f"the class {module.__name__}" if isinstance(module, type) else f"a {type(module).__name__}"
             raise InputError(f"a field must be an nn.Module, such as field=Drift() for a class Drift; got {given}.")
         self.module = module
-        for name, value in module.state_dict().items():
-            if value.dtype not in _STORED or (value.is_floating_point() and not bool(value.isfinite().all())):
-                what = "NaN or infinity" if value.dtype in _STORED else f"numbers of type {value.dtype}"
-                raise InputError(
-                    f"the field {type(module).__name__} keeps {what} in {name}, which checkpoints do not hold; make it "
-                    "another, or a buffer with persistent=False."
-                )
         named = inspect.signature(module.forward).parameters
         self._takes = [name for name in ("dynamics", "nearby") if name in named]
-        needed = [name for name, each in named.items() if each.default is each.empty and each.kind not in _OPTIONAL]
-        unknown = [name for name in needed[2:] if name not in self._takes]
-        if unknown:
-            raise InputError(
-                f"the forward of the field {type(module).__name__} needs {', '.join(unknown)}, which it is not given: "
-                "it is called with means and t, and with dynamics and nearby where it names them."
-            )
 
     def forward(
         self, means: Tensor, t: float, dynamics: Tensor | None = None, nearby: Nearby | None = None
@@ -83,11 +61,6 @@ class OwnField(nn.Module):
         """See motion/fields/deformation.py. Raises InputError where a parameter is not in one group."""
         grouped, name = getattr(self.module, "parameter_groups", None), type(self.module).__name__
         given = grouped() if grouped else {"mlp": self.parameters()}
-        if not isinstance(given, Mapping):
-            raise InputError(
-                f'parameter_groups() of {name} must return lists of parameters by name, such as {{"mlp": [...]}}, got '
-                f"a {type(given).__name__}; the learning rates are given by Parts(rates=...)."
-            )
         groups: dict[str, list[nn.Parameter]] = {group: list(each) for group, each in given.items()}
         listed = Counter(id(parameter) for group in groups.values() for parameter in group)
         missing = [name for name, each in self.module.named_parameters() if listed[id(each)] == 0]
@@ -96,21 +69,3 @@ class OwnField(nn.Module):
             if names:
                 raise InputError(f"parameter_groups() of {name} {fault} {', '.join(names)}.")
         return {name: group for name, group in groups.items() if group}
-
-    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
-        """Load as nn.Module does. Raises InputError where names or shapes are not those of the module."""
-        mine, given = (
-            {name.removeprefix("module."): tuple(value.shape) for name, value in each.items()}
-            for each in (self.state_dict(), state_dict)
-        )
-        wrong = [
-            f"{name} is {given.get(name, 'missing')} in the file, {mine.get(name, 'missing')} in the module"
-            for name in sorted(mine.keys() | given.keys())
-            if mine.get(name) != given.get(name)
-        ]
-        if wrong:
-            raise InputError(
-                f"is of another field than the module {type(self.module).__name__} that was given: {'; '.join(wrong)}. "
-                "Give a module of the class and the sizes that it was trained with."
-            )
-        return super().load_state_dict(state_dict, strict, assign)
