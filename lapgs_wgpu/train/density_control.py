@@ -57,19 +57,18 @@ class DensityControl:
         """Statistics of the Gaussians as they are now, before any view."""
         return Statistics.zeros(len(self._scene), self._scene.parameters["means"].device)
 
-    def change(self, step: int, *, moving: bool) -> int:
+    def change(self, step: int, *, moving: bool) -> None:
         """Make the changes that are planned after this step (counted from 1), with the optimizer's state.
 
-        moving: whether the field moves the Gaussians. Returns the number of those that were pruned because they
-        contribute too little. Raises InputError where no Gaussian would be left.
+        moving: whether the field moves the Gaussians. Raises InputError where no Gaussian would be left.
         """
-        pruned = self._prune_hidden(moving) if self._config.prunes_at(step, self._last) else 0
+        if self._config.prunes_at(step, self._last):
+            self._prune_hidden(moving)
         if self._config.changes_at(step):
             self._apply_rule(step)
         if self._config.resets_at(step):
             logits = reset_opacities(self._scene.parameters["opacity_logits"])
             self._optimizer.reset("opacity_logits", logits)
-        return pruned
 
     def _apply_rule(self, step: int) -> None:
         scene = self._scene
@@ -85,15 +84,14 @@ class DensityControl:
         self._optimizer.reorder(morton_order(scene.parameters["means"].detach()))
         self.statistics = self.nothing_seen()
 
-    def _prune_hidden(self, moving: bool) -> int:
-        """Prune the Gaussians that contribute too little to all images; how many."""
+    def _prune_hidden(self, moving: bool) -> None:
+        """Prune the Gaussians that contribute too little to all images."""
         views = [dataclasses.replace(view, camera=self._camera_of(view)) for view in self._views]
         most = contributions(self._scene, views, moving=moving)
         keep = (most >= self._config.min_contribution) | largest(most, LEAST_KEPT)
         if not keep.all():
             self._optimizer.edit_rows(keep, {name: row[:0] for name, row in self._scene.parameters.items()})
             self.statistics = self.statistics.of(keep)
-        return int((~keep).sum())
 
 
 def contributions(scene: Scene4D, views: Sequence[View], *, moving: bool) -> Tensor:

@@ -6,7 +6,6 @@ import json
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -49,7 +48,6 @@ class Log:
         self._began = time.perf_counter()
         self._start = self._began - (so_far or before)
         self._times: deque[float] = deque(maxlen=INTERVAL + 1)  # at which steps ended
-        self._pruned = self._pruned_before = 0  # in all, and until the last line
 
     def __enter__(self) -> Log:
         return self
@@ -70,23 +68,20 @@ class Log:
 
     def after_step(self, trainer: Trainer, result: StepResult, /) -> None:
         """Take in a step that is done; the loss of one that was skipped does not count. A callback of `Trainer`."""
-        self.step(result, len(trainer.scene), lambda: _spectrum(trainer))
+        self.step(result, len(trainer.scene))
 
-    def step(self, result: StepResult, gaussians: int, now: Callable[[], dict[str, Any]] = dict) -> None:
-        """Take in a step that is done. now: further entries of a line, asked only where a line is written."""
+    def step(self, result: StepResult, gaussians: int) -> None:
+        """Take in a step that is done, and the number of Gaussians after it."""
         step, last = result.step, result.step == self._steps
         self._fresh.append(result)
         self._times.append(time.perf_counter())
-        self._pruned += result.pruned
         if step % INTERVAL == 0 or last or self._progress.due:
             self._take_in()
         if not self._recent:
             return
         if step % INTERVAL == 0 or last:
             timing = {"seconds": round(self.seconds, 3), "steps_per_second": round(self._steps_per_second(), 3)}
-            self._write({"step": step, **self._means(gaussians), **now(), "timing": timing})
-        if last and self._pruned:
-            self.tell(f"pruned {self._pruned} Gaussians that hardly showed in any image (density.min_contribution)")
+            self._write({"step": step, **self._means(), "gaussians": gaussians, "timing": timing})
         self._progress.at(step, lambda: self._progress_line(step, gaussians))
 
     def _take_in(self) -> None:
@@ -103,19 +98,16 @@ class Log:
         steps, since = (len(self._times) - 1, self._times[0]) if len(self._times) > 1 else (1, self._began)
         return steps / max(self._times[-1] - since, 1e-9)
 
-    def _means(self, gaussians: int) -> dict[str, Any]:
-        """Loss, PSNR and loss terms in the mean over the last steps, and the numbers of Gaussians."""
+    def _means(self) -> dict[str, Any]:
+        """Loss, PSNR and loss terms in the mean over the last steps."""
         count = len(self._recent)
         terms = Counter[str]()
         for each in self._recent:
             terms.update({name: value / count for name, value in each.terms.items()})
-        pruned, self._pruned_before = self._pruned - self._pruned_before, self._pruned
         return {
             "loss": round(sum(each.loss for each in self._recent) / count, 7),
             "psnr": round(sum(each.psnr for each in self._recent) / count, 4),
             "terms": {name: round(value, 9) for name, value in terms.items()},
-            "gaussians": gaussians,
-            "pruned": pruned,
         }
 
     def _progress_line(self, step: int, gaussians: int) -> str:
@@ -166,8 +158,3 @@ def _continued(path: Path, done: int) -> tuple[BinaryIO, float]:
     with atomic_write(path) as file:
         file.write("".join(kept).encode())
     return path.open("ab", buffering=0), seconds  # a line is one write, and none waits for a later one to fail
-
-
-def _spectrum(trainer: Trainer) -> dict[str, Any]:
-    """The motion's spectrum after a step; nothing where there is none."""
-    return {name: [round(value, 6) for value in values.tolist()] for name, values in trainer.spectrum().items()}

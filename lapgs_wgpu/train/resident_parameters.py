@@ -201,17 +201,6 @@ class ResidentParameters:
         if part == "field" and self._frequencies is not None:
             self._frequencies.unpack(self._pool.array("frequencies", self._state_shape).read(), self.steps[FREQUENCIES])
 
-    def spectrum(self) -> dict[str, Tensor]:
-        """The motion's frequencies (K,) and amplitudes (K,), the newest ones."""
-        if "field" in self.values_on_host:
-            tensors = {name: self._field[f"motion.{name}"].detach() for name in ("frequencies", "alpha", "beta")}
-        else:
-            assert self._weights is not None
-            flat, places = torch.from_numpy(self.flat_weights("value").read()), self._weights.places
-            tensors = {name: _view(flat, places[f"motion.{name}"]) for name in ("frequencies", "alpha", "beta")}
-        power = (tensors["alpha"].square() + tensors["beta"].square()).mean(dim=1)
-        return {"frequencies": tensors["frequencies"], "amplitudes": power.sqrt()}
-
     @property
     def _state_shape(self) -> tuple[int]:
         assert self._weights is not None

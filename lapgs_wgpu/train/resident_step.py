@@ -133,14 +133,6 @@ class ResidentStep:
         tensors = [torch.from_numpy(array) for array in read_all(list(now.arrays().values()))]
         return Gaussians(**dict(zip(now.arrays(), tensors, strict=True)), antialiased=now.antialiased)
 
-    @torch.no_grad()
-    def spectrum(self) -> dict[str, Tensor]:
-        """The motion's frequencies and amplitudes after all steps, without the rest of the parameters."""
-        if not self._passes.moves or self._learners.frequencies is None:
-            return {}
-        self.settle()
-        return self.parameters.spectrum()
-
     def settle(self) -> None:
         """Wait for all steps."""
         while self._flying:

@@ -40,12 +40,10 @@ class StepResult:
     Attributes:
         step: its number, counted from 1.
         steps: the number of all steps.
-        pruned: number of Gaussians that were pruned because they contribute too little.
     """
 
-    def __init__(self, step: int, steps: int, measured: Callable[[], Measured], pruned: int = 0) -> None:
-        self.step, self.steps, self.pruned = step, steps, pruned
-        self._measured = measured
+    def __init__(self, step: int, steps: int, measured: Callable[[], Measured]) -> None:
+        self.step, self.steps, self._measured = step, steps, measured
 
     @property
     def loss(self) -> float:

@@ -180,13 +180,6 @@ class Trainer:
         while self.done < self.config.schedule.steps:
             yield self.step()
 
-    def spectrum(self) -> dict[str, Tensor]:
-        """The motion's frequencies (K,), cycles over the clip, and amplitudes (K,); nothing for a field without one."""
-        if self._resident is not None:
-            return self._resident.spectrum()
-        motion = self.scene.spectrum
-        return {} if motion is None else {"frequencies": motion.frequencies.detach(), "amplitudes": motion.amplitudes()}
-
     def evaluate(self, views: Sequence[View] | None = None) -> dict[str, Any]:
         """Measure the scene on views, the test views where None: the content of metrics.json (docs/metrics.md).
         Training views are seen by their corrected cameras."""
@@ -245,14 +238,14 @@ class Trainer:
             raise
         if self.timing is not None and field_times is not None:
             self.timing.set(field_times)
-        pruned = self._density.change(step, moving=moving)
+        self._density.change(step, moving=moving)
         if step % self.config.schedule.sh_interval == 0:
             self.scene.sh_degree = min(self.scene.sh_degree + 1, MAX_SH_DEGREE)
         self.done = step
         self.whole = True
         if self._resident is None:
             self._skips.note(measured().skipped)
-        return StepResult(step, self.config.schedule.steps, measured, pruned)
+        return StepResult(step, self.config.schedule.steps, measured)
 
     def _began(self) -> None:
         self.whole = False
