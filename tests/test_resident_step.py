@@ -170,7 +170,7 @@ def test_what_nobody_reads_stays_on_the_device(device: Device, dataset: Dataset,
     with torch.no_grad():
         drawn = scene.at(0.3)
     assert parameters.values_on_host == parameters.state_on_host == set()
-    trainer._learners.optimizer.reorder(torch.arange(len(scene)).flip(0))
+    trainer._learners.optimizer.edit_rows(torch.arange(len(scene)).flip(0))
     assert parameters.values_on_host == parameters.state_on_host == {"gaussians"}
     exact = scene.at(0.3)  # by torch, since it is differentiable
     assert parameters.values_on_host == {"gaussians", "field"}

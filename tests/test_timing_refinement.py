@@ -160,7 +160,7 @@ def test_an_interrupted_training_goes_on_to_the_same_bytes(
 @pytest.mark.parametrize("moments", [[0.1, 0.2], list(np.linspace(1, 0, 8))])
 def test_a_state_of_other_times_is_refused(dataset: Dataset, device: Device, moments: list[float]) -> None:
     with Trainer(configure(**GIVEN), dataset, device) as training:
-        state = training.state() | {"timing.moments": np.array(moments)}
+        state = training.state() | {"timing.times": dataset.times, "timing.moments": np.array(moments)}
         with pytest.raises(ValueError, match="moments"):
             training.restore(state)
 

@@ -81,7 +81,7 @@ class DensityControl:
                 f"density control leaves no Gaussian at step {step}; raise density.max_world_size (0 switches it off)."
             )
         self._optimizer.edit_rows(change.keep, change.added)
-        self._optimizer.reorder(morton_order(scene.parameters["means"].detach()))
+        self._optimizer.edit_rows(morton_order(scene.parameters["means"].detach()))
         self.statistics = self.nothing_seen()
 
     def _prune_hidden(self, moving: bool) -> None:
@@ -90,7 +90,7 @@ class DensityControl:
         most = contributions(self._scene, views, moving=moving)
         keep = (most >= self._config.min_contribution) | largest(most, LEAST_KEPT)
         if not keep.all():
-            self._optimizer.edit_rows(keep, {name: row[:0] for name, row in self._scene.parameters.items()})
+            self._optimizer.edit_rows(keep)
             self.statistics = self.statistics.of(keep)
 
 

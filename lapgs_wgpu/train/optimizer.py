@@ -80,21 +80,18 @@ class Optimizer:
                 if parameter.grad is not None:
                     torch.autograd.graph.increment_version(parameter)
 
-    def edit_rows(self, keep: Tensor, added: Mapping[str, Tensor]) -> None:
-        """Keep the Gaussians of a mask (N,) with their state, and append rows (M, ...) with a zero state."""
-        self.on_access("gaussians")
-        for name, old in self.gaussians.items():
-            rows = added[name]
-            zeros = torch.zeros_like(rows)
-            moments = {key: torch.cat([moment[keep], zeros]) for key, moment in self.moments(name).items()}
-            self._replace(name, torch.cat([old.detach()[keep], rows]), moments)
+    def edit_rows(self, rows: Tensor, added: Mapping[str, Tensor] | None = None) -> None:
+        """Keep Gaussians with their state, those of a mask (N,) or of indices (M,) in their order, and append new ones.
 
-    def reorder(self, order: Tensor) -> None:
-        """Put the Gaussians, with their state, into another order: indices (N,)."""
+        added: rows (K, ...) by name, which begin with a zero state; None for none.
+        """
         self.on_access("gaussians")
         for name, old in self.gaussians.items():
-            moments = {key: moment[order] for key, moment in self.moments(name).items()}
-            self._replace(name, old.detach()[order], moments)
+            new = old.detach()[:0] if added is None else added[name]
+            moments = {
+                key: torch.cat([moment[rows], torch.zeros_like(new)]) for key, moment in self.moments(name).items()
+            }
+            self._replace(name, torch.cat([old.detach()[rows], new]), moments)
 
     def reset(self, name: str, values: Tensor) -> None:
         """Give one of the Gaussians' parameters new values (N, ...) and a zero state."""

@@ -21,12 +21,12 @@ from lapgs_wgpu.train.start import start_from_points
 from lapgs_wgpu.train.trainer import Trainer
 
 FILM, MASKS = "a film with masks of what moves", "masks"  # the latter is lapgs-prepare's folder of them
-LARGE = {FILM: "film", "one moving camera": "hypernerf", "static cameras": "neu3d", "cameras all around": "dnerf"}
-SMALL = {
-    FILM: "film",
-    "one moving camera": "hypernerf-tiny",
-    "static cameras": "neu3d-tiny",
-    "cameras all around": "tiny",
+# By the arrangement of the cameras: the large preset, and the small one.
+PRESETS = {
+    FILM: ("film", "film"),
+    "one moving camera": ("hypernerf", "hypernerf-tiny"),
+    "static cameras": ("neu3d", "neu3d-tiny"),
+    "cameras all around": ("dnerf", "tiny"),
 }
 PATIENCE = 60.0  # minutes that a training with a large preset may take, unless others are given
 STEPS_PER_TIME = 20  # steps for each time of the clip, at least: what `tiny` has on D-NeRF's scenes
@@ -48,7 +48,7 @@ class Plan(NamedTuple):
 
 
 def camera_layout(dataset: Dataset) -> str:
-    """How the cameras of a capture are arranged: a key of LARGE and SMALL other than FILM."""
+    """How the cameras of a capture are arranged: a key of PRESETS other than FILM."""
     if dataset.still_cameras:
         return "static cameras"
     return "one moving camera" if dataset.own_footage or dataset.cloud is not None else "cameras all around"
@@ -95,8 +95,9 @@ def plan_training(
     layout = camera_layout(opened)
     if layout == "one moving camera" and (folder / MASKS).is_dir():
         layout = FILM
-    for preset in [SMALL[layout]] if device.is_cpu else [LARGE[layout], SMALL[layout]]:
-        last = preset == SMALL[layout]
+    small = PRESETS[layout][1]
+    for preset in (small,) if device.is_cpu else PRESETS[layout]:
+        last = preset == small
         config = load_config(preset, {"data.path": str(folder.resolve()), "exposure.enabled": exposure})
         # No densification beyond twice the initial number, so that the measured step tells of the whole training.
         config = dataclasses.replace(config, density=dataclasses.replace(config.density, limit=2 * config.points.count))

@@ -317,15 +317,12 @@ class Trainer:
             scene.field.load_state_dict(parts["field"])
         self._learners.restore(parts)
         if timing := {name: value.numpy() for name, value in parts.get("timing", {}).items()}:
-            scene.timing = checked_timing(timing.get("times", self.dataset.times), timing["moments"])  # older: no times
+            scene.timing = checked_timing(**timing)
         self._density.statistics = Statistics(**parts["statistics"])
         own = parts["training"]
         self.done, scene.sh_degree = int(own["done"]), int(own["sh_degree"])
-        self.warm_up_steps = int(own.get("warm_up", self.warm_up_steps))  # older states lack it, and the next one
-        self._ramp_steps = int(own.get("rising", self.config.schedule.warm_up - self.warm_up_steps))
-        if self._ramp_steps < 0:
-            raise ValueError("its rates rise over a negative number of steps")
-        self._set_field_fitted(bool(own.get("field_fitted", False)))
+        self.warm_up_steps, self._ramp_steps = int(own["warm_up"]), int(own["rising"])
+        self._set_field_fitted(bool(own["field_fitted"]))
         self._generator.set_state(own["random"])
         self._draws.left = own["order"].tolist()
-        self._plans.set_bands(self._drawn, int(own.get("bands", 1)))
+        self._plans.set_bands(self._drawn, int(own["bands"]))
