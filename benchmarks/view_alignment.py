@@ -15,10 +15,9 @@ from torch import Tensor
 from lapgs_wgpu.data.views import View
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.camera_refinement import CameraDescent, changed_camera, image_motion, scene_points, whitening
-from lapgs_wgpu.train.config import LossWeights
+from lapgs_wgpu.train.config import LossWeights, Rate
 from lapgs_wgpu.train.fused_loss import render_loss
 from lapgs_wgpu.train.ground_truth import marked_pixels, upload_rgba
-from lapgs_wgpu.train.learning_rate import Rate
 
 STEPS = 24
 RATE = Rate(4e-3, 2e-4, STEPS)  # radians of image motion: 1.5 degrees together

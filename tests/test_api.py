@@ -37,11 +37,10 @@ from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.motion.fields.own_field import OwnField
 from lapgs_wgpu.motion.timing import Timing
 from lapgs_wgpu.splat.rotation import rotate, rotation_matrices
-from lapgs_wgpu.train.config import LossWeights
+from lapgs_wgpu.train.config import LossWeights, Rate
 from lapgs_wgpu.train.exchange_step import ExchangeStep
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.ground_truth import LEFT_OUT, upload_rgba
-from lapgs_wgpu.train.learning_rate import Rate
 from lapgs_wgpu.train.loss_terms import LossTerm, torch_loss
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run_folder import load_state, save_state

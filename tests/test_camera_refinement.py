@@ -34,10 +34,9 @@ from lapgs_wgpu.train.camera_refinement import (
     image_motion,
     whitening,
 )
-from lapgs_wgpu.train.config import CamerasConfig
+from lapgs_wgpu.train.config import CamerasConfig, Rate
 from lapgs_wgpu.train.fused_loss import render_loss
 from lapgs_wgpu.train.ground_truth import upload_rgba
-from lapgs_wgpu.train.learning_rate import Rate
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.static_config import static_config
 from lapgs_wgpu.train.trainer import Trainer

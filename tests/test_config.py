@@ -9,7 +9,7 @@ import pytest
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.motion.fields.config import FieldConfig
-from lapgs_wgpu.train.learning_rate import Rate
+from lapgs_wgpu.train.config import Rate
 from lapgs_wgpu.train.presets import (
     ABLATIONS,
     REMOVED,

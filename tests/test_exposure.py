@@ -19,10 +19,10 @@ from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.splat.rasterize import rasterize
+from lapgs_wgpu.train.config import Rate
 from lapgs_wgpu.train.exposure import ExposurePasses, Exposures
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.ground_truth import upload_rgba
-from lapgs_wgpu.train.learning_rate import Rate
 from lapgs_wgpu.train.trainer import Trainer
 
 CORRECTION = torch.tensor([[0.9, 0.1, -0.05, 0.02], [0.03, 1.2, 0.0, -0.1], [-0.02, 0.05, 0.8, 0.2]])

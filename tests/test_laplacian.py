@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion, TimeMotion
-from lapgs_wgpu.train.learning_rate import Rate
+from lapgs_wgpu.train.config import Rate
 from lapgs_wgpu.train.optimizer import FrequencyOptimizer
 
 K, WIDTH, INPUTS = 5, 6, 4

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from lapgs_wgpu.train.learning_rate import Rate
+from lapgs_wgpu.train.config import Rate
 from lapgs_wgpu.train.optimizer import Optimizer
 
 RATES = {"means": Rate(1e-2, 1e-3, 10), "weights": Rate(5e-2, 5e-2, 1), "mlp": Rate(1e-3, 1e-3, 1)}

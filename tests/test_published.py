@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.learning_rate import Rate
+from lapgs_wgpu.train.config import Config, Rate
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.setup import resolve_for_dataset
 

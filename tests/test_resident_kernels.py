@@ -25,10 +25,9 @@ from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.splat.splat_layout import MEAN, RADIUS, SPLAT_FLOATS
 from lapgs_wgpu.train.camera_refinement import CameraRefinement, scene_points
-from lapgs_wgpu.train.config import CamerasConfig
+from lapgs_wgpu.train.config import CamerasConfig, Rate
 from lapgs_wgpu.train.densify import Statistics
 from lapgs_wgpu.train.exposure import Exposures
-from lapgs_wgpu.train.learning_rate import Rate
 from lapgs_wgpu.train.optimizer import ADAM_EPS, LARGEST_FREQUENCY_STEP, FrequencyOptimizer
 from lapgs_wgpu.train.resident_corrections import ResidentCorrections
 from lapgs_wgpu.train.resident_parameters import check_finite

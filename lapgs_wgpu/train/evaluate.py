@@ -24,7 +24,7 @@ from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS
-from lapgs_wgpu.train.environment import environment
+from lapgs_wgpu.train.host import environment
 from lapgs_wgpu.train.image_metrics import MS_SSIM_SMALLEST, differing_pixels, ms_ssim, psnr, ssim
 from lapgs_wgpu.train.lpips import SMALLEST, Lpips
 

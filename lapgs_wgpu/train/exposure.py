@@ -18,7 +18,7 @@ from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
-from lapgs_wgpu.train.learning_rate import Rate
+from lapgs_wgpu.train.config import Rate
 from lapgs_wgpu.train.optimizer import restore_rows
 
 MEAN_DECAY, SQUARE_DECAY = 0.9, 0.999  # Adam's

@@ -1,4 +1,4 @@
-"""What a training asks of its host: how many threads torch uses in a step, and what the C library does with memory."""
+"""The host of a training: threads of torch in a step, memory of the C library, and with what a run was made."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import platform
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import metadata
 
 import torch
 
@@ -64,3 +65,13 @@ def return_freed_memory() -> None:
 
 def _is_glibc() -> bool:
     return sys.platform == "linux" and platform.libc_ver()[0] == "glibc"
+
+
+def environment(device: Device) -> dict[str, str]:
+    """With what a run was made: versions, adapter, driver, torch's threads."""
+    packages = ("lapgs-wgpu", "torch", "wgpu", "numpy")
+    found = {name.replace("-", "_"): metadata.version(name) for name in packages}
+    found |= {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}"}
+    found |= {"adapter": device.info.name, "backend": device.info.backend, "driver": device.info.driver}
+    found["torch_threads"] = str(torch.get_num_threads())
+    return found

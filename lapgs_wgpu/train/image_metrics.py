@@ -35,11 +35,8 @@ def ssim(image: Tensor, target: Tensor, pixels: Tensor | None = None) -> Tensor:
     (Other libraries leave the border out or pad it otherwise, and give other numbers.)
     """
     a, b = image.permute(2, 0, 1), target.permute(2, 0, 1)
-    mean_a, mean_b, aa, bb, ab = _blur(torch.cat([a, b, a * a, b * b, a * b])).chunk(5)
-    covariance = ab - mean_a * mean_b
-    variances = (aa - mean_a * mean_a) + (bb - mean_b * mean_b)
-    luminance = (2 * mean_a * mean_b + SSIM_C1) / (mean_a * mean_a + mean_b * mean_b + SSIM_C1)
-    similar = luminance * (2 * covariance + SSIM_C2) / (variances + SSIM_C2)
+    luminance, contrast = _similarity(a, b)
+    similar = luminance * contrast
     return similar.mean() if pixels is None else similar[:, pixels].mean()
 
 
@@ -53,12 +50,8 @@ def ms_ssim(image: Tensor, target: Tensor) -> Tensor:
     a, b = image.permute(2, 0, 1), target.permute(2, 0, 1)
     product: Tensor | None = None
     for level, weight in enumerate(MS_SSIM_WEIGHTS):
-        inside = _blur(torch.cat([a, b, a * a, b * b, a * b]))[:, 5:-5, 5:-5]
-        mean_a, mean_b, aa, bb, ab = inside.chunk(5)
-        variances = (aa - mean_a * mean_a) + (bb - mean_b * mean_b)
-        similar = (2 * (ab - mean_a * mean_b) + SSIM_C2) / (variances + SSIM_C2)
-        if level == len(MS_SSIM_WEIGHTS) - 1:
-            similar = similar * (2 * mean_a * mean_b + SSIM_C1) / (mean_a * mean_a + mean_b * mean_b + SSIM_C1)
+        luminance, contrast = (each[:, 5:-5, 5:-5] for each in _similarity(a, b))
+        similar = luminance * contrast if level == len(MS_SSIM_WEIGHTS) - 1 else contrast
         term = similar.mean(dim=(1, 2)).clamp(min=0) ** weight
         product = term if product is None else product * term
         odd = [side % 2 for side in a.shape[1:]]
@@ -89,6 +82,14 @@ def differing_pixels(image: NDArray[np.float32], drawn: NDArray[np.float32]) -> 
     difference = np.maximum(np.maximum(low - image, image - high), 0.0).max(axis=2)
     core = ndimage.binary_opening(difference > DIFFERENCE)
     return ndimage.binary_dilation(core, iterations=2) & (difference > 0.5 * DIFFERENCE)
+
+
+def _similarity(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    """SSIM's luminance, and its contrast and structure, (C, H, W) each, of two images (C, H, W)."""
+    mean_a, mean_b, aa, bb, ab = _blur(torch.cat([a, b, a * a, b * b, a * b])).chunk(5)
+    luminance = (2 * mean_a * mean_b + SSIM_C1) / (mean_a * mean_a + mean_b * mean_b + SSIM_C1)
+    variances = (aa - mean_a * mean_a) + (bb - mean_b * mean_b)
+    return luminance, (2 * (ab - mean_a * mean_b) + SSIM_C2) / (variances + SSIM_C2)
 
 
 def _blur(planes: Tensor) -> Tensor:

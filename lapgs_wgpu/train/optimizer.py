@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion
-from lapgs_wgpu.train.learning_rate import Rate
+from lapgs_wgpu.train.config import Rate
 
 ADAM_EPS = 1e-15  # 3DGS's: gradients of single Gaussians are tiny
 LARGEST_FREQUENCY_STEP = 0.02  # cycles over the clip

@@ -12,8 +12,8 @@ from typing import Any, Protocol
 from torch import nn
 
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.train.config import Rate
 from lapgs_wgpu.train.densify import DensityRule, published_rule
-from lapgs_wgpu.train.learning_rate import Rate
 from lapgs_wgpu.train.loss_terms import TAKEN_NAMES, LossTerm
 from lapgs_wgpu.train.optimizer import FrequencyOptimizer
 from lapgs_wgpu.train.step_result import StepResult

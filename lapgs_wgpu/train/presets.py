@@ -19,8 +19,7 @@ from lapgs_wgpu.errors import InputError, shown
 from lapgs_wgpu.io.dataclass_table import build_dataclass, checked, did_you_mean, field_types, from_text
 from lapgs_wgpu.io.safe_json_toml import read_toml
 from lapgs_wgpu.motion.fields.config import Method
-from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.learning_rate import Rate
+from lapgs_wgpu.train.config import Config, Rate
 
 Table = dict[str, Any]
 ADVICE = '; add it, or start the file with base = "dnerf"'

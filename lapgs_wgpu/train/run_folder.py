@@ -22,8 +22,7 @@ from lapgs_wgpu.io.listing import listed
 from lapgs_wgpu.io.safe_json_toml import read_toml
 from lapgs_wgpu.io.safetensors_file import pack_tensors, unpack_tensors
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.environment import environment
-from lapgs_wgpu.train.host import step_threads
+from lapgs_wgpu.train.host import environment, step_threads
 from lapgs_wgpu.train.presets import write_toml
 
 LOST = 0.5  # share of the moving pixels; where fewer are drawn as they are, that is a warning

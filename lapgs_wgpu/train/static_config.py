@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.learning_rate import Rate
+from lapgs_wgpu.train.config import Config, Rate
 
 # The schedule, in shares of its steps, and the rates are its own: what the static fit is sure of decides what is found.
 DENSIFY = (0.375, 0.875)
