@@ -155,20 +155,6 @@ def test_a_step_that_breaks_off_did_not_begin(
         assert equal(trainer.state(), before)
 
 
-def test_a_state_stays_as_it_is(dataset: Dataset, device: Device) -> None:
-    """While the trainer that gave it, and one that took it, go on."""
-    with Trainer(configure(), dataset, device) as one, Trainer(configure(), dataset, device) as two:
-        for _ in range(12):
-            one.step()
-        state = one.state()
-        before = {name: value.copy() for name, value in state.items()}
-        one.step()
-        two.restore(state)
-        for _ in range(2):
-            two.step()
-    assert equal(state, before)
-
-
 def test_a_scene_to_start_from_keeps_its_shape_and_its_timing(dataset: Dataset, device: Device) -> None:
     """Though the capture has fewer times than the field has frequencies; and a restored state, too."""
     config = configure()
@@ -427,18 +413,6 @@ def test_terms_of_ones_own_leave_out_what_the_losses_do(device: Device) -> None:
     assert in_torch == pytest.approx(expected, rel=1e-5)
     assert (gradient[:, left_out] == 0).all()
     assert (gradient[:3, ~left_out] != 0).all()
-
-
-def test_a_torch_term_of_a_window_asks_nothing_of_what_is_left_out(device: Device) -> None:
-    """A term that looks at a pixel's neighbours has a gradient there, too."""
-    rgba = np.full((4, 6, 4), 255, np.uint8)
-    rgba[1, 2] = LEFT_OUT
-    planes = np.random.default_rng(0).random((4, 4, 6)).astype(np.float32)
-    term = TorchLoss("mine", lambda image, truth: (image[:, 1:] - image[:, :-1]).square().mean())
-    shown, truth = DeviceArray.upload(device, "image", planes), upload_rgba(device, rgba)
-    _, gradient = torch_loss(term, shown, truth, (0.0, 0.0, 0.0), 1.0)
-    assert (gradient[:, 1, 2] == 0).all()
-    assert (gradient[:3, 1, 1] != 0).all()
 
 
 def test_terms_of_the_gaussians_and_weights_by_step(dataset: Dataset, device: Device) -> None:

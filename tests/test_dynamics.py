@@ -23,30 +23,25 @@ def spread(last: float) -> Tensor:
     return d
 
 
-def test_outliers_of_a_crafted_set() -> None:
-    # Mean 16/7, mean square 52/7: the bound is 2.286 + 1.485 = 3.77.
-    assert outliers(spread(4.0)).tolist() == [False] * 5 + [True] * 2
-    # It moves with the distances. Mean 14.8/7, mean square 43.12/7: 2.114 + 1.300 = 3.414.
-    assert outliers(spread(3.4)).tolist() == [False] * 7
-
-
-def test_the_deviation_is_of_all_rows_not_of_a_sample() -> None:
-    distances = torch.tensor([0.0, 1.0, 1.0, 3.0, 3.0, 3.6, 3.6])
-    assert distances.mean() + distances.std(correction=0) < 3.6 < distances.mean() + distances.std()
-    assert outliers(spread(3.6)).tolist() == [False] * 5 + [True] * 2
-
-
-def test_distance_is_from_the_mean_row() -> None:
-    d = spread(4.0) + torch.linspace(-3, 3, 16)
-    assert outliers(d).tolist() == [False] * 5 + [True] * 2
-
-
-def test_distance_is_euclidean() -> None:
+def far_in_all_entries() -> Tensor:
+    """Two rows 4 away, as there are 16 entries, and two 5 away; the bound is 1.8 + 2.227 = 4.03."""
     d = torch.zeros(10, 16)
-    d[0], d[1] = 1.0, -1.0  # 4 away, as there are 16 entries
-    d[2:4, 0] = torch.tensor([5.0, -5.0])
-    # Mean 18/10, mean square 82/10: the bound is 1.8 + 2.227 = 4.03.
-    assert outliers(d).nonzero()[:, 0].tolist() == [2, 3]
+    d[:2], d[2:4, 0] = torch.tensor([[1.0], [-1.0]]), torch.tensor([5.0, -5.0])
+    return d
+
+
+@pytest.mark.parametrize(
+    ("d", "out"),
+    [
+        (spread(4.0), [5, 6]),  # mean 16/7, mean square 52/7: the bound is 2.286 + 1.485 = 3.77
+        (spread(3.4), []),  # it moves with the distances; mean 14.8/7, mean square 43.12/7: 2.114 + 1.300 = 3.414
+        (spread(3.6), [5, 6]),  # the deviation is that of all rows; a sample's, 1.53, would let none stand out
+        (spread(4.0) + torch.linspace(-3, 3, 16), [5, 6]),  # the distance is that from the mean row
+        (far_in_all_entries(), [2, 3]),  # and Euclidean
+    ],
+)
+def test_outliers_of_crafted_sets(d: Tensor, out: list[int]) -> None:
+    assert outliers(d).nonzero()[:, 0].tolist() == out
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 1000])

@@ -8,8 +8,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from helpers.image_losses import BACKGROUND, CAMERA, TRUTH, WEIGHTS, gaussians, gradients
-from helpers.loss_reference import exposure, total
+from helpers.loss_reference import exposure
 from helpers.scenes import relative
 from helpers.training import configure
 from numpy.typing import NDArray
@@ -18,11 +17,8 @@ from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
-from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.train.config import Rate
 from lapgs_wgpu.train.exposure import ExposurePasses, Exposures
-from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
-from lapgs_wgpu.train.ground_truth import upload_rgba
 from lapgs_wgpu.train.trainer import Trainer
 
 CORRECTION = torch.tensor([[0.9, 0.1, -0.05, 0.02], [0.03, 1.2, 0.0, -0.1], [-0.02, 0.05, 0.8, 0.2]])
@@ -61,28 +57,6 @@ def test_exposure(device: Device, size: tuple[int, int]) -> None:
     assert (d_image[3] == 0).all()
     d_rows = back.d_rows.read().astype(np.float64)
     assert relative(torch.from_numpy(d_rows.sum(axis=0)), leaves[1].grad) < 1e-5
-
-
-@pytest.mark.kernels
-def test_a_step_is_that_of_the_rasterizer_and_the_references(device: Device) -> None:
-    scene, other = gaussians(), gaussians()
-    mine, theirs = (CORRECTION.clone().requires_grad_() for _ in range(2))
-    done = render_loss(scene, CAMERA, upload_rgba(device, TRUTH), BACKGROUND, WEIGHTS["all"], device, mine)
-    done.loss.backward()
-    drawn = rasterize(
-        other.means, other.quats, other.scales, other.opacities, other.sh, CAMERA,
-        sh_degree=1, background=BACKGROUND, depth=False, device=device,
-    )  # fmt: skip
-    truth = torch.from_numpy(TRUTH.astype(np.float32) / 255).double()
-    loss = total(exposure(drawn.image.double(), theirs.double()), truth, WEIGHTS["all"])
-    loss.backward()
-    assert done.loss.item() == pytest.approx(loss.item(), rel=1e-5)
-    assert mine.grad is not None
-    assert theirs.grad is not None
-    assert relative(mine.grad, theirs.grad) < 1e-4
-    expected = gradients(other, RenderLoss(loss, {}, drawn.radii, drawn.means2d))
-    for name, gradient in gradients(scene, done).items():
-        assert relative(gradient, expected[name]) < 1e-4, name
 
 
 # The corrections

@@ -32,7 +32,7 @@ from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.train import fused_loss, image_metrics
 from lapgs_wgpu.train.config import LossWeights
-from lapgs_wgpu.train.fused_loss import RenderLoss
+from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.ground_truth import upload_rgba
 from lapgs_wgpu.train.image_loss import ImageLoss
 
@@ -171,20 +171,29 @@ def test_a_term_of_weight_0_runs_no_passes(device: Device, monkeypatch: pytest.M
 # With the rasterizer
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
-def test_a_step_is_that_of_the_rasterizer_and_the_references(device: Device, antialiased: bool) -> None:
+CORRECTION = torch.tensor([[0.9, 0.1, -0.05, 0.02], [0.03, 1.2, 0.0, -0.1], [-0.02, 0.05, 0.8, 0.2]])
+
+
+@pytest.mark.parametrize(("antialiased", "corrected"), [(False, False), (True, False), (False, True)])
+def test_a_step_is_that_of_the_rasterizer_and_the_references(
+    device: Device, antialiased: bool, corrected: bool
+) -> None:
     scene, other = (gaussians(antialiased=antialiased) for _ in range(2))
-    done = step(device, scene)
+    mine, theirs = (CORRECTION.clone().requires_grad_() if corrected else None for _ in range(2))
+    done = render_loss(scene, CAMERA, upload_rgba(device, TRUTH), BACKGROUND, WEIGHTS["all"], device, mine)
     done.loss.backward()
     drawn = rasterize(
         other.means, other.quats, other.scales, other.opacities, other.sh, CAMERA,
         sh_degree=1, background=BACKGROUND, antialiased=antialiased, depth=False, device=device,
     )  # fmt: skip
     truth = torch.from_numpy(TRUTH.astype(np.float32) / 255)
-    loss = total(drawn.image.double(), truth.double(), WEIGHTS["all"])
+    shown = drawn.image.double() if theirs is None else loss_reference.exposure(drawn.image.double(), theirs.double())
+    loss = total(shown, truth.double(), WEIGHTS["all"])
     loss.backward()
     assert done.loss.item() == pytest.approx(loss.item(), rel=1e-5)
-    image = drawn.image.detach().double()
+    if theirs is not None:
+        assert relative(mine.grad, theirs.grad) < 1e-4
+    image = shown.detach()
     assert done.terms == pytest.approx(
         {
             "l1": loss_reference.l1(image, truth).item(),

@@ -60,11 +60,9 @@ def test_value_is_the_robust_distance_from_the_chord(device: Device) -> None:
     torch.testing.assert_close(curve.speed.grad, torch.zeros(3), rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("on_device", [False, True])
-def test_chosen_rows_move_as_all_do(device: Device, on_device: bool) -> None:
+def test_chosen_rows_move_as_all_do(device: Device) -> None:
     scene = scene_of(device, configure().field)
     assert scene.field is not None
-    scene.field.on_device = on_device
     for parameter in scene.field.parameters():
         nn.init.normal_(parameter, std=0.1, generator=torch.Generator().manual_seed(1))
     rows = torch.tensor([7, 2, 2, 5])

@@ -44,31 +44,19 @@ def test_rate_is_exponential_and_then_constant() -> None:
         Rate(-1e-3, 1e-3, 10)
 
 
-def test_step_is_adam_at_the_rate_of_the_step() -> None:
+@pytest.mark.parametrize(("share", "highest"), [(1.0, None), (0.25, None), (1.0, 0.1), (0.5, 0.1)])
+def test_a_step_is_adam_at_a_share_of_the_rates_and_at_most_the_highest(share: float, highest: float | None) -> None:
+    """With eps 1e-15 the first step moves each value by the learning rate, against its gradient."""
     gaussians, mlp, optimizer = make()
-    before = gaussians["means"].detach().clone()
-    run(optimizer, gaussians, mlp, range(1, 2), torch.arange(6.0))
-    # With eps 1e-15 the first step moves each value by the learning rate, against its gradient.
-    expected = before - RATES["means"].at(1) * before.sign()
-    assert torch.allclose(gaussians["means"], expected, atol=1e-7)
-
-
-def test_a_step_at_a_share_of_the_rates() -> None:
-    gaussians, mlp, optimizer = make()
-    before, weights = gaussians["means"].detach().clone(), mlp.detach().clone()
-    (gaussians["means"].square().sum() + mlp.square().sum()).backward()
-    optimizer.step(1, 0.25)
-    assert torch.allclose(gaussians["means"], before - 0.25 * RATES["means"].at(1) * before.sign(), atol=1e-7)
-    assert torch.allclose(mlp, weights - 0.25 * RATES["mlp"].at(1) * weights.sign(), atol=1e-7)
-
-
-def test_no_rate_exceeds_the_highest_one_of_its_group() -> None:
-    gaussians, mlp, optimizer = make()
-    optimizer.highest = {"mlp": 0.1 * RATES["mlp"].at(1)}
+    rates = {name: rate.at(1) for name, rate in RATES.items()}
+    if highest is not None:
+        rates["mlp"] *= highest
+        optimizer.highest = {"mlp": rates["mlp"]}
     means, weights = gaussians["means"].detach().clone(), mlp.detach().clone()
-    run(optimizer, gaussians, mlp, range(1, 2), torch.arange(6.0))
-    assert torch.allclose(gaussians["means"], means - RATES["means"].at(1) * means.sign(), atol=1e-7)
-    assert torch.allclose(mlp, weights - 0.1 * RATES["mlp"].at(1) * weights.sign(), atol=1e-7)
+    (gaussians["means"].square().sum() + mlp.square().sum()).backward()
+    optimizer.step(1, share)
+    assert torch.allclose(gaussians["means"], means - share * rates["means"] * means.sign(), atol=1e-7)
+    assert torch.allclose(mlp, weights - share * rates["mlp"] * weights.sign(), atol=1e-7)
 
 
 def test_what_a_step_writes_is_counted() -> None:

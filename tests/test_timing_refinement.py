@@ -71,9 +71,11 @@ def refinement(scene: Scene4D, truth: Callable[[View], Tensor], times: Sequence[
     return TimingRefinement(scene, views_at(times), image, picture, time_step(np.asarray(times)))
 
 
-def refine(scene: Scene4D, truth: Callable[[View], Tensor]) -> None:
+def refine(scene: Scene4D, truth: Callable[[View], Tensor], times: int = 1) -> TimingRefinement:
     found = refinement(scene, truth)
-    found.set(found.fitted(0))
+    for number in range(times):
+        found.set(found.fitted(number))
+    return found
 
 
 def film(scene: Scene4D, moments: np.ndarray = MOMENTS) -> Callable[[View], Tensor]:
@@ -84,9 +86,7 @@ def film(scene: Scene4D, moments: np.ndarray = MOMENTS) -> Callable[[View], Tens
 
 def test_it_finds_which_moments_a_film_shows(device: Device) -> None:
     scene = moving(device)
-    found = refinement(scene, film(scene))
-    for number in range(6):
-        found.set(found.fitted(number))
+    found = refine(scene, film(scene), 6)
     np.testing.assert_allclose(scene.timing.moments, MOMENTS, atol=1e-3)
     np.testing.assert_array_equal(scene.timing.times, TIMES)
     assert found.report()["frames_most"] == pytest.approx(0.4, abs=0.01)
@@ -115,9 +115,7 @@ def test_what_does_not_count_is_not_looked_at(device: Device) -> None:
     found = []
     for truth in (half, covered):
         scene.timing = EVEN
-        refined = refinement(scene, truth)
-        for number in range(6):
-            refined.set(refined.fitted(number))
+        refine(scene, truth, 6)
         found.append(np.abs(scene.timing.moments - MOMENTS).max())
     assert found[0] > 0.01
     assert found[1] < 1e-3
@@ -125,10 +123,7 @@ def test_what_does_not_count_is_not_looked_at(device: Device) -> None:
 
 def test_moments_rise_and_stay_near_their_times(device: Device) -> None:
     scene = moving(device)
-    backwards = film(scene, MOMENTS[::-1])
-    found = refinement(scene, backwards)
-    for number in range(9):
-        found.set(found.fitted(number))
+    refine(scene, film(scene, MOMENTS[::-1]), 9)
     assert (np.diff(scene.timing.moments) >= 0).all()
     assert np.abs(scene.timing.moments - TIMES).max() <= FARTHEST * 0.1 + 1e-12
 
@@ -163,14 +158,6 @@ def test_a_state_of_other_times_is_refused(dataset: Dataset, device: Device, mom
         state = training.state() | {"timing.times": dataset.times, "timing.moments": np.array(moments)}
         with pytest.raises(ValueError, match="moments"):
             training.restore(state)
-
-
-def test_times_stay_until_the_first_step_that_is_planned(dataset: Dataset, device: Device) -> None:
-    with Trainer(configure(**GIVEN), dataset, device) as training:
-        for result in training:
-            assert (training.scene.timing is EVEN) == (result.step < 15)
-    with Trainer(configure(timing__refine="false"), dataset, device) as training:
-        assert training.timing is None
 
 
 def test_a_correction_that_fails_changes_nothing(
