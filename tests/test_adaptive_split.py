@@ -156,7 +156,7 @@ def test_outliers_are_split_whatever_their_score() -> None:
 
 def test_quantile_zero_is_the_plain_split(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "SPLIT_QUANTILE", 0.0)
-    rows, statistics = make_rows(30), Statistics.zeros(30, torch.device("cpu"))
+    rows, statistics = make_rows(30), Statistics.zeros(30)
     statistics.gradients, statistics.views = torch.ones(30), torch.ones(30)
     changes = [
         published_rule(DensityState(1, rows, statistics, config, EXTENT, torch.Generator().manual_seed(0)))

@@ -34,7 +34,7 @@ def make_rows(scales: list[float], opacities: list[float] | None = None) -> dict
 
 
 def make_statistics(gradients: list[float]) -> Statistics:
-    statistics = Statistics.zeros(len(gradients), torch.device("cpu"))
+    statistics = Statistics.zeros(len(gradients))
     statistics.gradients = torch.tensor(gradients) * 5
     statistics.views = torch.full((len(gradients),), 5.0)
     return statistics
@@ -49,7 +49,7 @@ def change(
 
 def test_statistics_are_means_over_visible_views_in_normalised_device_coordinates() -> None:
     camera = Camera(np.eye(3), np.eye(4), 200, 100)
-    statistics = Statistics.zeros(3, torch.device("cpu"))
+    statistics = Statistics.zeros(3)
     statistics.add(torch.tensor([4, 0, 0]), torch.tensor([[0.03, 0.08], [9.0, 9.0], [0.0, 0.0]]), camera)
     statistics.add(torch.tensor([2, 7, 0]), torch.tensor([[0.0, 0.0], [0.01, 0.0], [0.0, 0.0]]), camera)
     # Pixel gradients times half the image's width and height; what is not visible does not count.

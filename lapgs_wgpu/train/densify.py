@@ -43,9 +43,9 @@ class Statistics:
     views: Tensor
 
     @staticmethod
-    def zeros(count: int, device: torch.device) -> Statistics:
+    def zeros(count: int) -> Statistics:
         """Nothing was seen yet."""
-        return Statistics(*torch.zeros(2, count, device=device).unbind())
+        return Statistics(*torch.zeros(2, count).unbind())
 
     def add(self, radii: Tensor, d_means2d: Tensor, camera: Camera) -> None:
         """Take in a view: radii (N,), 0 of what it does not show, and gradients (N, 2) by the centers, per pixel."""

@@ -51,11 +51,7 @@ class DensityControl:
         self._scene, self._optimizer, self._rule = scene, optimizer, rule
         self._views, self._camera_of = spread_views(views, MOST_VIEWS), camera_of
         self._extent, self._generator = extent, generator
-        self.statistics = self.nothing_seen()
-
-    def nothing_seen(self) -> Statistics:
-        """Statistics of the Gaussians as they are now, before any view."""
-        return Statistics.zeros(len(self._scene), self._scene.parameters["means"].device)
+        self.statistics = Statistics.zeros(len(scene))
 
     def change(self, step: int, *, moving: bool) -> None:
         """Make the changes that are planned after this step (counted from 1), with the optimizer's state.
@@ -82,7 +78,7 @@ class DensityControl:
             )
         self._optimizer.edit_rows(change.keep, change.added)
         self._optimizer.edit_rows(morton_order(scene.parameters["means"].detach()))
-        self.statistics = self.nothing_seen()
+        self.statistics = Statistics.zeros(len(scene))
 
     def _prune_hidden(self, moving: bool) -> None:
         """Prune the Gaussians that contribute too little to all images."""

@@ -120,12 +120,10 @@ class Optimizer:
             for i, parameter in enumerate(group["params"]):
                 prefix = f"{group['name']}.{i}."
                 mine = {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
-                for key, value in mine.items():
-                    shape = torch.Size() if key == "step" else parameter.shape
-                    if value.shape != shape or value.dtype != torch.float32:
-                        raise ValueError(f"its {prefix}{key} is {value.dtype} of shape {tuple(value.shape)}")
-                if mine and mine.keys() != {"step", "exp_avg", "exp_avg_sq"}:
-                    raise ValueError(f"its {prefix[:-1]} holds {sorted(mine)}")
+                shapes = {"step": torch.Size(), "exp_avg": parameter.shape, "exp_avg_sq": parameter.shape}
+                found = {key: value.shape for key, value in mine.items() if value.dtype == torch.float32}
+                if mine and found != shapes:
+                    raise ValueError(f"its {prefix[:-1]} holds {found}")
                 if mine:
                     self._adam.state[parameter] = mine
 
