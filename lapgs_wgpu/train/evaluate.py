@@ -58,7 +58,8 @@ def evaluate(
     progress: takes a step for each view.
     Raises InputError where there are no views, or a picture or a mask cannot be read.
     """
-    _check_any(views)
+    if not views:
+        raise InputError("there are no views to measure: most captures have no validation views, only test views.")
     start = time.perf_counter()
     color = torch.full((3,), BACKGROUND_LEVELS[background])
     rows = []
@@ -86,18 +87,6 @@ def evaluate(
         "seconds": round(time.perf_counter() - start, 3),
         "environment": environment(scene.device),
     }
-
-
-def mean_psnr(scene: Scene4D, views: Sequence[View], background: str) -> float:
-    """The mean over the views of the PSNR, dB, as in `evaluate`. Raises InputError."""
-    _check_any(views)
-    color = torch.full((3,), BACKGROUND_LEVELS[background])
-    return float(np.mean([psnr(_unit(_render(scene, view, color)), _unit(_on(color, view))) for view in views]))
-
-
-def _check_any(views: Sequence[View]) -> None:
-    if not views:
-        raise InputError("there are no views to measure: most captures have no validation views, only test views.")
 
 
 def _on(color: Tensor, view: View) -> NDArray[np.uint8]:

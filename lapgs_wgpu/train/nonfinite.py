@@ -15,8 +15,7 @@ from torch import Tensor
 
 from lapgs_wgpu.errors import NumericalError
 
-# A skipped step counts so much, and each other step takes 1 of it back: one in five may be skipped for ever.
-SKIPPED, LIMIT = 4, 40  # ten in a row reach the limit, which ends a training
+MOST_SKIPPED = 10  # steps in a row, which end a training
 
 Tensors = Mapping[str, Sequence[Tensor]]  # by name of a group, such as an optimizer's
 
@@ -53,16 +52,3 @@ def check_parameters(parameters: Tensors) -> None:
 
 def _not_finite(groups: Tensors) -> list[str]:
     return [name for name, tensors in groups.items() if not finite({name: tensors})]
-
-
-class SkipCounter:
-    """Ends a training of which too many steps are skipped."""
-
-    def __init__(self) -> None:
-        self._level = 0
-
-    def note(self, skipped: Skipped | None) -> None:
-        """Take in a step. Raises NumericalError where too many were skipped."""
-        self._level = max(0, self._level - 1) if skipped is None else self._level + SKIPPED
-        if skipped is not None and self._level >= LIMIT:
-            raise NumericalError(f"too many steps had values that are not finite; the last: {skipped}")

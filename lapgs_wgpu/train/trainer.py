@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lapgs_wgpu.data.views import Dataset, View
+from lapgs_wgpu.errors import NumericalError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView, captured_arc
 from lapgs_wgpu.motion.scene import Scene4D
@@ -22,12 +23,12 @@ from lapgs_wgpu.train.camera_refinement import CameraRefinement
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config
 from lapgs_wgpu.train.densify import Statistics
 from lapgs_wgpu.train.density_control import DensityControl
-from lapgs_wgpu.train.evaluate import evaluate, mean_psnr
+from lapgs_wgpu.train.evaluate import evaluate
 from lapgs_wgpu.train.exchange_step import ExchangeStep
 from lapgs_wgpu.train.ground_truth import GroundTruth
 from lapgs_wgpu.train.host import step_threads, torch_threads
 from lapgs_wgpu.train.learners import Learners
-from lapgs_wgpu.train.nonfinite import SkipCounter
+from lapgs_wgpu.train.nonfinite import MOST_SKIPPED, Skipped
 from lapgs_wgpu.train.parts import Parts
 from lapgs_wgpu.train.resident_step import ResidentStep
 from lapgs_wgpu.train.setup import set_up, why_exchange
@@ -128,14 +129,14 @@ class Trainer:
                 dataset.time_gap,
             )
         self._timing_steps = config.timing.corrections(config.schedule.steps) if self.timing else []
-        self._skips = SkipCounter()
+        self._skipped = 0  # steps in a row
         shared = self._learners, self._density, self._truth, self._draws
         self._exchange = ExchangeStep(config, scene, self.parts.losses, dataset, *shared)
         self._resident = None
         if config.step_place == "resident":
             self._resident = ResidentStep(config, scene, *shared, dataset.moments)
             self._resident.broken = self._broken
-            self._resident.tell = lambda measured: self._skips.note(measured.skipped)
+            self._resident.tell = lambda measured: self._note(measured.skipped)
         self._plans, camera = rasterizer_of(scene.device).plans, dataset.train[0].camera
         self._drawn = (camera.width, camera.height, True)  # the kind of images that the steps draw
         self._plans.set_bands(self._drawn, 1)
@@ -188,7 +189,7 @@ class Trainer:
 
     def psnr(self, views: Sequence[View]) -> float:
         """The mean over views of the PSNR, dB, as `evaluate` measures it."""
-        return mean_psnr(self.scene, self._as_seen(views), self.config.data.background)
+        return float(self.evaluate(views)["psnr"])
 
     @property
     def initial_view(self) -> InitialView:
@@ -244,8 +245,14 @@ class Trainer:
         self.done = step
         self.whole = True
         if self._resident is None:
-            self._skips.note(measured().skipped)
+            self._note(measured().skipped)
         return StepResult(step, self.config.schedule.steps, measured)
+
+    def _note(self, skipped: Skipped | None) -> None:
+        """Take in whether a step was skipped. Raises NumericalError where too many in a row were."""
+        self._skipped = 0 if skipped is None else self._skipped + 1
+        if self._skipped == MOST_SKIPPED:
+            raise NumericalError(f"{MOST_SKIPPED} steps in a row had values that are not finite; the last: {skipped}")
 
     def _began(self) -> None:
         self.whole = False
