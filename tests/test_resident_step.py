@@ -62,8 +62,10 @@ def disturb(trainer: Trainer) -> None:
             if name == "log_scales":
                 tensor[:5] = -20.0  # below the floor
         if scene.field is not None:
-            for _, tensor in sorted(scene.field.named_parameters()):
-                tensor += 0.2 * torch.randn(tensor.shape, generator=generator)
+            for name, tensor in sorted(scene.field.named_parameters()):
+                # Uneven enough that the acceleration loss is no direction of a rounding error.
+                size = 2.0 if name.endswith(".table") else 0.2
+                tensor += size * torch.randn(tensor.shape, generator=generator)
             scene.field.heads.weight *= 0.3
     scene.sh_degree = 2
     if trainer.cameras is not None:
@@ -114,7 +116,8 @@ def test_gradients_are_those_of_torch(device: Device, dataset: Dataset, kind: st
     mine, expected = by_resident(trainers[0], task), by_torch(trainers[1], sample, moving=moving)
     assert mine.keys() == expected.keys()
     # SwiftShader's exp is off by more, which the losses' signs of small differences make larger.
-    bound = 1e-3 if "SwiftShader" in device.info.name else 3e-5
+    bounds = {"SwiftShader": 1e-3, "llvmpipe": 1e-5}
+    bound = next((bound for name, bound in bounds.items() if name in device.info.name), 3e-5)
     for name, exact in expected.items():
         if exact.abs().max() == 0:
             assert mine[name].abs().max() == 0, name
