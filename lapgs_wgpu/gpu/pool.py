@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -45,17 +46,18 @@ class BufferPool:
         The content must not change between recording and submission of a command that reads it.
         """
         if self.device.recording is not None:
-            self.device.recording.note(self, name, content)
+            return self.device.recording.constant(content)  # type: ignore[no-any-return]
         array = self.array(f"constant {name}", (len(content),), "uint8")
         if self._constants.get(name) != content:
             array.write(np.frombuffer(content, np.uint8))
             self._constants[name] = content
         return array
 
-    def refresh(self, name: str, content: bytes) -> None:
-        """Write a constant again, unless it still has this content."""
-        if self._constants.get(name) != content:
-            self.constant(name, content)
+    def varying(self, name: str, write: Callable[[], bytes]) -> DeviceArray:
+        """A constant whose content, which `write` gives, differs from one replay of a recording to the next."""
+        if self.device.recording is not None:
+            return self.device.recording.varying((self, name), write)  # type: ignore[no-any-return]
+        return self.constant(name, write())
 
     @property
     def nbytes(self) -> int:

@@ -16,7 +16,6 @@ from lapgs_wgpu.gpu.array import DeviceArray, read_all
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
-from lapgs_wgpu.gpu.profile import Profile
 from lapgs_wgpu.gpu.radix_sort import RadixSort
 from lapgs_wgpu.gpu.scan import Scan
 from lapgs_wgpu.splat.buffer_plan import BufferPlan, BufferPlans, roomy
@@ -67,7 +66,6 @@ class Rasterizer:
         *,
         depth: bool = False,
         gradient: bool = False,
-        profile: Profile | None = None,
     ) -> Drawing:
         """Submit the passes that draw an image, which is valid once `grow_on_overflow` has returned False.
 
@@ -75,10 +73,10 @@ class Rasterizer:
         """
         drawing = self._begin(gaussians, camera, background, depth=depth, gradient=gradient)
         for band in range(drawing.plan.bands):
-            with Commands(self.device, profile) as commands:
+            with Commands(self.device) as commands:
                 drawing.lists = self._draw_band(commands, drawing, band)
             if self._subgroup_mismatch("rasterize", drawing):
-                return self.draw(gaussians, camera, background, depth=depth, gradient=gradient, profile=profile)
+                return self.draw(gaussians, camera, background, depth=depth, gradient=gradient)
         return drawing
 
     def record(
@@ -165,7 +163,7 @@ class Rasterizer:
     def _draw_band(self, commands: Commands, drawing: Drawing, band: int) -> TileLists:
         device, pool, config, gaussians = self.device, self.pool, self.config, drawing.gaussians
         n, capacity, tiles = len(gaussians), drawing.plan.capacity, self._band_tiles(drawing, band)
-        frame = commands.varying(lambda: self._frame(drawing, band))
+        frame = pool.varying(f"frame {band}", lambda: self._frame(drawing, band))
         frame = drawing.frames[band] = drawing.move(commands, frame, band) if drawing.move else frame
         needed, visible = drawing.needed[band], pool.array("visible", (1,), "uint32")
         tile_counts, ids, keys, offsets = (
@@ -215,10 +213,10 @@ class Rasterizer:
         first, last = self._band_rows(drawing, band)
         return (last - first) * self._tiles(drawing.camera)[1]
 
-    def _frame(self, drawing: Drawing, band: int) -> DeviceArray:
+    def _frame(self, drawing: Drawing, band: int) -> bytes:
         camera = drawing.camera
         rows, columns = self._tiles(camera)
-        content = Kernel.get(self.device, "compact").uniform(
+        return Kernel.get(self.device, "compact").uniform(
             "Frame",
             view=camera.T_cam_world.T.reshape(-1).tolist(),
             focal=(camera.K[0, 0], camera.K[1, 1]),
@@ -233,7 +231,6 @@ class Rasterizer:
             antialiased=int(drawing.gaussians.antialiased),
             near=camera.near,
         )
-        return self.pool.constant(f"frame {band}", content)
 
     def _subgroup_mismatch(self, name: str, drawing: Drawing) -> bool:
         """Return whether the driver has split a pass's workgroups into several subgroups, checked after its first run.
@@ -253,9 +250,7 @@ class Rasterizer:
 
     # Backward --------------------------------------------------------------------------------------------------------
 
-    def backward(
-        self, drawing: Drawing, d_image: DeviceArray, *, camera: bool = False, profile: Profile | None = None
-    ) -> GaussianGradients:
+    def backward(self, drawing: Drawing, d_image: DeviceArray, *, camera: bool = False) -> GaussianGradients:
         """Submit the backward passes of a drawing.
 
         d_image: gradient of the image's planes, with that of alpha instead of the transmittance. camera: whether the
@@ -266,11 +261,11 @@ class Rasterizer:
             raise RuntimeError("backward needs the drawing that was drawn last; its buffers now hold another image")
         d_splats = self.pool.array("d_splats", (len(drawing.gaussians), SPLAT_FLOATS))
         for band in range(drawing.plan.bands):
-            with Commands(self.device, profile) as commands:
+            with Commands(self.device) as commands:
                 self._backward_band(commands, drawing, band, d_image, d_splats)
             if self._subgroup_mismatch("rasterize_bwd", drawing):
-                return self.backward(self._drawn_again(drawing), d_image, camera=camera, profile=profile)
-        with Commands(self.device, profile) as commands:
+                return self.backward(self._drawn_again(drawing), d_image, camera=camera)
+        with Commands(self.device) as commands:
             return self._project_bwd(commands, drawing, d_splats, camera=camera)
 
     def record_bwd(

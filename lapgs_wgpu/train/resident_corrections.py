@@ -98,12 +98,11 @@ class ResidentCorrections:
             return frame
         kernel = Kernel.get(self._device, "move_camera")
 
-        def uniform() -> DeviceArray:
-            content = kernel.uniform("Moved", row=cameras.numbers[self._view.camera], unit=cameras.extent)
-            return self._pool.constant("moved", content)
+        def write() -> bytes:
+            return kernel.uniform("Moved", row=cameras.numbers[self._view.camera], unit=cameras.extent)
 
         moved = self._pool.array(f"frame {band}", frame.shape, frame.dtype)
-        given = {"moved": commands.varying(uniform), "placed": frame, "cameras": self._value("cameras")}
+        given = {"moved": self._pool.varying("moved", write), "placed": frame, "cameras": self._value("cameras")}
         commands.dispatch(kernel, 1, **given, frame=moved)
         return moved
 
@@ -143,13 +142,12 @@ class ResidentCorrections:
             return
         kernel = Kernel.get(self._device, "exposure_step")
 
-        def uniform() -> DeviceArray:
+        def write() -> bytes:
             count, rate = len(exposures.values), exposures.rate.at(self._step)
-            content = kernel.uniform("ExposureStep", number=self._numbers[self._view.name], count=count, rate=rate)
-            return self._pool.constant("exposure step", content)
+            return kernel.uniform("ExposureStep", number=self._numbers[self._view.name], count=count, rate=rate)
 
         arrays = {"guard": guard, "d_exposure": self._d_exposure, "exposures": self._value("exposures")}
-        commands.dispatch(kernel, 1, descent=commands.varying(uniform), **arrays)
+        commands.dispatch(kernel, 1, descent=self._pool.varying("exposure step", write), **arrays)
 
     def _step_camera(self, commands: Commands, guard: DeviceArray, frame: DeviceArray, geometry: DeviceArray) -> None:
         cameras, count = self._cameras, geometry.shape[0]
@@ -160,14 +158,13 @@ class ResidentCorrections:
         commands.dispatch(motion_kernel, 1, seen=seen, frame=frame, geometry=geometry, motion=motion)
         kernel = Kernel.get(self._device, "camera_step")
 
-        def uniform() -> DeviceArray:
+        def write() -> bytes:
             assert self._pace is not None
             number, pace = cameras.numbers[self._view.camera], self._pace._asdict()
-            content = kernel.uniform("CameraStep", number=number, cameras=len(cameras.numbers), **pace)
-            return self._pool.constant("camera step", content)
+            return kernel.uniform("CameraStep", number=number, cameras=len(cameras.numbers), **pace)
 
         arrays = {"guard": guard, "motion": motion, "d_camera": self._d_camera, "common_motions": self._common}
-        descent = commands.varying(uniform)
+        descent = self._pool.varying("camera step", write)
         commands.dispatch(kernel, 1, descent=descent, cameras=self._value("cameras"), **arrays)
 
     def gradients(self) -> dict[str, list[Tensor]]:

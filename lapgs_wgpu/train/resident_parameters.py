@@ -22,7 +22,7 @@ from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.fields.laplacian import VARIANCE_FLOOR, VARIANCE_SPREAD
 from lapgs_wgpu.motion.passes.activation_passes import GEOMETRY_FLOATS, SH_FLOATS
-from lapgs_wgpu.motion.passes.field_weights import FieldWeights, Segment
+from lapgs_wgpu.motion.passes.field_weights import ALIGNED, FieldWeights, Segment
 from lapgs_wgpu.motion.passes.grid_field_passes import FieldArrays
 from lapgs_wgpu.train.optimizer import LARGEST_FREQUENCY_STEP, AdamState, FrequencyOptimizer, Optimizer
 
@@ -102,6 +102,7 @@ class ResidentParameters:
         self._field = dict(field_module.named_parameters()) if field_module is not None else {}
         self._weights = weights
         self.blocks: dict[str, Block] = {}
+        self._gradients: dict[str, DeviceArray] = {}  # of all blocks of a part, by part
         self.steps: dict[str, int] = {}
         # The parts that the host may have changed since they were pushed: their values, the optimizers' state of them.
         self.values_on_host, self.state_on_host = set(PARTS), set(PARTS)
@@ -118,9 +119,16 @@ class ResidentParameters:
 
     def _layout(self, part: str) -> dict[str, Block]:
         """The blocks of a part, with arrays for its tensors as they are."""
-        blocks = self._gaussians_layout() if part == "gaussians" else self._field_layout()
+        blocks, size = self._gaussians_layout() if part == "gaussians" else self._field_layout(), 0
+        firsts = []
         for block in blocks:
-            block.arrays = {kind: self._pool.array(f"{block.name} {kind}", block.shape) for kind in KINDS}
+            firsts.append(size)
+            size += -(-math.prod(block.shape) // ALIGNED) * ALIGNED
+        for kind in KINDS:
+            whole = self._pool.array(f"{part} {kind}", (size,))
+            for block, first in zip(blocks, firsts, strict=True):
+                block.arrays[kind] = DeviceArray(whole.buffer, block.shape, offset=4 * first)
+        self._gradients[part] = self._pool.array(f"{part} gradient", (size,))
         return {block.name: block for block in blocks}
 
     def _gaussians_layout(self) -> list[Block]:
@@ -237,13 +245,14 @@ class ResidentParameters:
 
     def clear_gradients(self, commands: Commands) -> None:
         """Record zeros for the gradients, which each step of Adam leaves."""
-        for block in self.blocks.values():
-            commands.clear(block.arrays["gradient"])
+        for array in self._gradients.values():
+            commands.clear(array)
 
     def record_check(self, commands: Commands, bad: DeviceArray, *, moving: bool) -> None:
         """Record the search for gradients that are not finite."""
-        for block in self._moved(moving=moving):
-            check_finite(commands, self._pool, block.name, block.arrays["gradient"], bad)
+        for part, gradients in self._gradients.items():
+            if moving or part == "gaussians":
+                check_finite(commands, self._pool, part, gradients, bad)
 
     def count_step(self, *, moving: bool) -> None:
         """A step that moves the parameters is about to be recorded."""
@@ -251,26 +260,31 @@ class ResidentParameters:
             for name in block.parts:
                 self.steps[name] += 1
 
-    def write_rates(self, rates: Mapping[str, float], *, moving: bool) -> None:
-        """Upload the learning rates of a step. rates: of the optimizer's groups."""
-        table: list[tuple[float, float]] = []
+    def _rates(self, rates: Mapping[str, float], *, moving: bool) -> bytes:
+        """The corrected rates of a step, a pair for each column that has its own. rates: of the optimizer's groups."""
+        table, first = np.zeros((_MOST_RATES, 2), np.float32), 0
         for block in self._moved(moving=moving):
             columns = block.rate_columns
-            rows = [(0.0, 0.0)] * columns
             for name, (_, place) in block.parts.items():
                 if name != FREQUENCIES:
-                    rows[place if columns > 1 else slice(None)] = [
-                        _corrected(rates[block.group or name], self.steps[name])
-                    ] * len(range(columns)[place])
-            table += rows
-        self._pool.array("rates", (_MOST_RATES, 2)).rows(0, len(table)).write(np.array(table, np.float32))
+                    own = table[first : first + columns]
+                    own[place if columns > 1 else 0] = _corrected(rates[block.group or name], self.steps[name])
+            first += columns
+        return table[:first].tobytes()
 
     def record_adam(
-        self, commands: Commands, guard: DeviceArray, frequency_rate: Callable[[], float], *, moving: bool
+        self,
+        commands: Commands,
+        guard: DeviceArray,
+        rates_of: Callable[[], Mapping[str, float]],
+        frequency_rate: Callable[[], float],
+        *,
+        moving: bool,
     ) -> None:
-        """Record a step of the optimizers, by the rates that were written."""
+        """Record a step of the optimizers, by the rates of its groups and of the frequencies."""
         kernel, first = Kernel.get(self._device, "adam"), 0
-        rates = self._pool.array("rates", (_MOST_RATES, 2))
+        written = self._pool.varying(f"rates {moving}", lambda: self._rates(rates_of(), moving=moving))
+        rates = DeviceArray(written.buffer, (written.nbytes // 8, 2), offset=written.offset)
         for block in self._moved(moving=moving):
             count = block.arrays["value"].size if block.moved is None else block.moved
             content = kernel.uniform("Adam", count=count, columns=block.rate_columns, first=first)
@@ -295,9 +309,9 @@ class ResidentParameters:
         kernel, places = Kernel.get(self._device, "adam_frequencies"), self._weights.places
         config, limit = self._weights.config, self._frequencies.limit
 
-        def write() -> DeviceArray:
+        def write() -> bytes:
             corrected, factor = _corrected(rate(), self.steps[FREQUENCIES])
-            content = kernel.uniform(
+            return kernel.uniform(
                 "Frequencies",
                 width=config.width,
                 components=config.components,
@@ -311,12 +325,11 @@ class ResidentParameters:
                 floor=VARIANCE_FLOOR,
                 spread=VARIANCE_SPREAD,
             )
-            return self._pool.constant("frequencies uniform", content)
 
         commands.dispatch(
             kernel,
             1,
-            spectrum=commands.varying(write),
+            spectrum=self._pool.varying("frequencies uniform", write),
             guard=guard,
             d_weights=self.flat_weights("gradient"),
             weights=self.flat_weights("value"),
@@ -333,9 +346,11 @@ class ResidentParameters:
 
 def check_finite(commands: Commands, pool: BufferPool, name: str, values: DeviceArray, bad: DeviceArray) -> None:
     """Record that `bad` becomes odd where a value is not finite. name: of the uniform in the pool."""
-    kernel = Kernel.get(commands.device, "check_finite")
-    uniform = pool.constant(f"check {name}", kernel.uniform("Check", count=values.size))
-    commands.dispatch(kernel, -(-values.size // 1024), check=uniform, values=values, bad=bad)
+    kernel, most = Kernel.get(commands.device, "check_finite"), commands.device.max_binding // 1024 * 256
+    for first in range(0, values.size, most):
+        part = DeviceArray(values.buffer, (min(most, values.size - first),), offset=values.offset + 4 * first)
+        uniform = pool.constant(f"check {name} {first}", kernel.uniform("Check", count=part.size))
+        commands.dispatch(kernel, -(-part.size // 1024), check=uniform, values=part, bad=bad)
 
 
 def _view(flat: Tensor, place: Segment) -> Tensor:

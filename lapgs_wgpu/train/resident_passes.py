@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from lapgs_wgpu.gpu.array import DeviceArray
-from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.gpu.recording import Recording
@@ -32,13 +31,8 @@ _DYNAMICS_GROUPS, _MOST_COLUMNS = 64, 256  # common/dynamics.wgsl
 class Recorded(NamedTuple):
     """The passes of a step. told: what is read of it later."""
 
-    recording: Recording | None
     drawing: Drawing
     told: list[DeviceArray]
-
-    def holds(self, device: Device) -> bool:
-        """Whether it can be replayed."""
-        return self.recording is not None and self.recording.generation == device.generation
 
 
 class ResidentPasses:
@@ -62,7 +56,7 @@ class ResidentPasses:
         self._activation = ActivationPasses(scene.device, scene.field_config)
         self.rasterizer, self._losses = rasterizer_of(scene.device), image_loss_of(scene.device)
         self._pool = BufferPool(scene.device)
-        self._recordings: dict[tuple[Any, ...], Recorded] = {}
+        self._recordings: dict[tuple[Any, ...], tuple[Recording, Recorded]] = {}
         self._checked = False
         self.dynamics_loss = bool(config.loss.dynamics) and scene.field_config.dynamics_size > 0
         self._task: Task
@@ -89,7 +83,6 @@ class ResidentPasses:
         self._task = task
         self.corrections.begin(task.sample.view, task.scheduled.step)
         self.parameters.count_step(moving=task.scheduled.moving)
-        self.parameters.write_rates(task.rates, moving=task.scheduled.moving)
         held = self._losses.held(truth)
         commands.copy(truth, held)
         return self._recorded(commands, task, held, judged=judged)
@@ -128,24 +121,21 @@ class ResidentPasses:
             *(task.sh_degree, task.sample.background, camera.width, camera.height, plan, judged, len(self._scene)),
             self.corrections.moves_camera,
         )
-        found = self._recordings.get(shape)
-        if found is not None and found.recording is not None and found.holds(self._device):
-            found.drawing.camera = camera
-            commands.replay(found.recording)
-            return found
-        # Textures follow their buffers by copies that no recording has.
-        recording = None if self._device.textures else Recording(self._device.generation)
+        self._recordings = {key: each for key, each in self._recordings.items() if each[0].holds}
+        if shape in self._recordings:
+            recording, step = self._recordings[shape]
+            step.drawing.camera = camera
+            commands.replay(recording)
+            return step
+        if self._device.textures:  # copies to them depend on what was done before
+            return self._record(commands, task, truth, judged=judged)
+        recording = Recording(self._device)
         with commands.taken_down(recording):
-            step = self._record(commands, task, truth, recording, judged=judged)
-        if recording is not None:
-            recording.generation = self._device.generation
-            of_today = {key: each for key, each in self._recordings.items() if each.holds(self._device)}
-            self._recordings = of_today | {shape: step}
+            step = self._record(commands, task, truth, judged=judged)
+        self._recordings[shape] = recording, step
         return step
 
-    def _record(
-        self, commands: Commands, task: Task, truth: DeviceArray, recording: Recording | None, *, judged: bool
-    ) -> Recorded:
+    def _record(self, commands: Commands, task: Task, truth: DeviceArray, *, judged: bool) -> Recorded:
         sample = task.sample
         values, gradients = self.parameters.arrays("value"), self.parameters.arrays("gradient")
         guard, bad, dead = (self.word(name) for name in ("guard", "bad", "dead"))
@@ -168,7 +158,7 @@ class ResidentPasses:
         if self._field is not None and decoding is not None:
             self._decode_bwd(commands, values, gradients, decoding, comparison, line, totals)
         self._record_end(commands, task, drawing, by_drawn, terms, judged=judged)
-        return Recorded(recording, drawing, [guard, bad, dead, terms, totals, *drawing.needed])
+        return Recorded(drawing, [guard, bad, dead, terms, totals, *drawing.needed])
 
     def _decode(
         self, commands: Commands, task: Task, values: FieldArrays
@@ -300,11 +290,10 @@ class ResidentPasses:
         plan = drawing.plan
         rounds = int(bool(self.rasterizer.config.round_splats))
 
-        def guarded_step() -> DeviceArray:
-            content = close.uniform("Guarded", step=self._task.scheduled.step, capacity=plan.capacity, rounds=rounds)
-            return self._pool.constant("guarded", content)
+        def write() -> bytes:
+            return close.uniform("Guarded", step=self._task.scheduled.step, capacity=plan.capacity, rounds=rounds)
 
-        guarded = commands.varying(guarded_step)
+        guarded = self._pool.varying("guarded", write)
         for needed in drawing.needed:
             commands.dispatch(close, 1, guarded=guarded, needed=needed, bad=bad, guard=guard)
         if judged:
@@ -323,6 +312,7 @@ class ResidentPasses:
                 d_splats=by_drawn.splats,
                 statistics=self.seen(),
             )
-        self.parameters.record_adam(commands, guard, lambda: self._task.frequency_rate, moving=moving)
+        rates = (lambda: self._task.rates), (lambda: self._task.frequency_rate)
+        self.parameters.record_adam(commands, guard, *rates, moving=moving)
         geometry = self.parameters.blocks["geometry"].arrays["value"]
         self.corrections.record_step(commands, guard, drawing.frames[0], geometry)

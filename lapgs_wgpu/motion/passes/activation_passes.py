@@ -141,16 +141,15 @@ class ActivationPasses:
         drawn: Gaussians[DeviceArray],
         **more: DeviceArray,
     ) -> None:
-        def write() -> DeviceArray:
+        def write() -> bytes:
             given = {"outputs": self._outputs, "mirror": self._mirror}
-            content = kernel.uniform("Acceleration", **given, share=line.share(), scale=line.scale)
-            return self.pool.constant("acceleration", content)
+            return kernel.uniform("Acceleration", **given, share=line.share(), scale=line.scale)
 
         commands.dispatch(
             kernel,
             -(-line.before.points.count // 64),
-            samples=self._samples.constant(commands, "line", line.sampling),
-            acceleration=commands.varying(write),
+            samples=self._samples.uniform("line", line.sampling),
+            acceleration=self.pool.varying("acceleration", write),
             biases_before=line.before.biases,
             biases_after=line.after.biases,
             geometry=geometry,

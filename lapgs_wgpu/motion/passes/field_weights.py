@@ -22,7 +22,7 @@ from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
 from lapgs_wgpu.motion.passes.decoder_passes import DecoderShape, decoder_shape
 
 _NONE = 0xFFFFFFFF  # pack_weights.wgsl
-_ALIGNED = 64  # floats; a multiple of 256 bytes, at which a binding may begin
+ALIGNED = 64  # floats; a multiple of 256 bytes, at which a binding may begin
 _BIASES = 20  # floats of the heads' biases, as activate.wgsl binds them
 _HEADS = sum(GEOMETRY)
 
@@ -51,7 +51,7 @@ class _Packing:
 
     def add(self, name: str, sources: NDArray[np.integer], factors: NDArray[np.floating] | float = 1.0) -> None:
         """A matrix of places among the weights, negative for zeros, and factors that broadcast to its shape."""
-        size = -(-sources.size // _ALIGNED) * _ALIGNED
+        size = -(-sources.size // ALIGNED) * ALIGNED
         places, scales = np.full(size, _NONE, np.uint32), np.zeros(size, np.float32)
         places[: sources.size] = np.where(sources < 0, _NONE, sources).reshape(-1)
         scales[: sources.size] = np.broadcast_to(factors, sources.shape).reshape(-1)
@@ -166,7 +166,7 @@ class FieldWeights:
         self._pack(commands, self._heads, weights, packed)
         if self.shape.motion:
             series = self._pool.array(f"series {name}", (self.config.width,))
-            spectrum = commands.varying(lambda: self._spectrum(name, t()))
+            spectrum = self._spectrum(name, t)
             commands.dispatch(
                 Kernel.get(self._device, "spectrum"),
                 -(-self.config.width // 64),
@@ -200,25 +200,20 @@ class FieldWeights:
             return
         series = self._pool.array(f"series {name}", (self.config.width,))
         d_series = self._pool.array("d_series", (self.config.width,))
-        arrays = {"spectrum": self._spectrum(name, t()), "weights": weights, "d_weights": d_weights}
+        arrays = {"spectrum": self._spectrum(name, t), "weights": weights, "d_weights": d_weights}
         both = {f"d_{name}": segment.of(d_packed) for name, segment in self._heads.segments.items()}
         fold = Kernel.get(self._device, "fold_motion_bwd")
         commands.dispatch(fold, self.config.width, **arrays, series=series, d_series=d_series, **both)
         back = Kernel.get(self._device, "spectrum_bwd")
         commands.dispatch(back, self.config.components, **arrays, d_series=d_series)
 
-    def _spectrum(self, name: str, t: float) -> DeviceArray:
-        place = {key: self.places[of].first for key, of in _SPECTRUM.items()}
-        content = Kernel.get(self._device, "spectrum").uniform(
-            "Spectrum",
-            width=self.config.width,
-            components=self.config.components,
-            columns=self.shape.placed,
-            time=t,
-            unit=self.config.unit,
-            **place,
+    def _spectrum(self, name: str, t: Time) -> DeviceArray:
+        config, places = self.config, {key: self.places[of].first for key, of in _SPECTRUM.items()}
+        sizes = {"width": config.width, "components": config.components, "columns": self.shape.placed}
+        kernel = Kernel.get(self._device, "spectrum")
+        return self._pool.varying(
+            f"spectrum {name}", lambda: kernel.uniform("Spectrum", time=t(), unit=config.unit, **sizes, **places)
         )
-        return self._pool.constant(f"spectrum {name}", content)
 
     def _pack(
         self, commands: Commands, packing: _Packing, weights: DeviceArray, packed: DeviceArray, *, back: bool = False

@@ -51,7 +51,7 @@ class SamplePasses:
         samples = sampling()
         points = self._pool.array(f"points {name}", (samples.count, 4))
         kernel = Kernel.get(self._device, "place_points", SAMPLED=not every, OFFSET=samples.reach > 0)
-        uniform = self.constant(commands, name, sampling)
+        uniform = self.uniform(name, sampling)
         groups = -(-samples.count // 64)
         commands.dispatch(kernel, groups, samples=uniform, geometry=geometry, points=points)
         return points
@@ -65,13 +65,13 @@ class SamplePasses:
         commands.dispatch(
             kernel,
             -(-chosen.size // 64),
-            samples=self.constant(commands, name, sampling),
+            samples=self.uniform(name, sampling),
             row=self._pool.constant(f"row {columns}", kernel.uniform("Row", columns=columns)),
             chosen=chosen,
             all=every,
         )
 
-    def constant(self, commands: Commands, name: str, sampling: Sampling) -> DeviceArray:
+    def uniform(self, name: str, sampling: Sampling) -> DeviceArray:
         """The uniform of the samples."""
         kernel = Kernel.get(self._device, "place_points")
-        return commands.varying(lambda: self._pool.constant(f"samples {name}", sampling().uniform(kernel)))
+        return self._pool.varying(f"samples {name}", lambda: sampling().uniform(kernel))
