@@ -46,7 +46,7 @@ class BufferPool:
         The content must not change between recording and submission of a command that reads it.
         """
         if self.device.recording is not None:
-            return self.device.recording.constant(content)  # type: ignore[no-any-return]
+            return self.device.recording.constant(content)
         array = self.array(f"constant {name}", (len(content),), "uint8")
         if self._constants.get(name) != content:
             array.write(np.frombuffer(content, np.uint8))
@@ -56,7 +56,7 @@ class BufferPool:
     def varying(self, name: str, write: Callable[[], bytes]) -> DeviceArray:
         """A constant whose content, which `write` gives, differs from one replay of a recording to the next."""
         if self.device.recording is not None:
-            return self.device.recording.varying((self, name), write)  # type: ignore[no-any-return]
+            return self.device.recording.varying((self, name), write)
         return self.constant(name, write())
 
     @property
