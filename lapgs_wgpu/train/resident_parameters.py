@@ -141,9 +141,9 @@ class ResidentParameters:
             Block("sh", (n, SH_FLOATS), None, colors, moving=False),
         ]
         if self._weights is not None:
-            beside = self._weights.shape.beside
-            dynamics = {"dynamics": (every, slice(0, beside - 1))} if "dynamics" in self._gaussians else {}
-            blocks.append(Block("beside", (n, beside), None, dynamics, ones=True))
+            size = self._weights.dynamics
+            dynamics = {"dynamics": (every, slice(0, size))} if "dynamics" in self._gaussians else {}
+            blocks.append(Block("beside", (n, size + 1), None, dynamics, ones=True))
         return blocks
 
     def _field_layout(self) -> list[Block]:

@@ -93,7 +93,6 @@ class ResidentPasses:
         with Commands(self._device) as commands:
             commands.clear(dead)
             if self._field is not None:
-                self._field.begin(commands, values)
                 decoding = self._field.decode(commands, 0, values, lambda: t)
             return self._activate(commands, degree, decoding, dead)
 
@@ -166,7 +165,6 @@ class ResidentPasses:
         sample, field = task.sample, self._field
         if field is None or not task.scheduled.moving:
             return None, None, None
-        field.begin(commands, values)
         decoding, comparison, line = field.decode(commands, 0, values, self._time), None, None
         if sample.near is not None:
             near_time = self._of_sample("near_time")
@@ -234,15 +232,13 @@ class ResidentPasses:
     ) -> None:
         field, smooth = self._field, self._config.smoothness
         assert field is not None
-        field.decode_bwd(commands, decoding, values, gradients, first=True)
-        for each in () if line is None else (line.before, line.after):
-            field.decode_bwd(commands, each, values, gradients, first=False)
+        for each in (decoding, *(() if line is None else (line.before, line.after))):
+            field.decode_bwd(commands, each, values, gradients)
         if comparison is not None:
             weights = [weight / comparison.points[0].count for weight in (smooth.static, smooth.temporal)]
             for total, sums, weight in zip(TOTALS, comparison.sums, weights, strict=False):
                 self._total(commands, sums, total, weight, totals)
             field.compare_bwd(commands, comparison, gradients, weights)
-        field.end(commands, gradients)
         if self.dynamics_loss:
             self._dynamics(commands, values.beside, gradients.beside, totals)
 

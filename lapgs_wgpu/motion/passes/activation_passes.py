@@ -150,8 +150,8 @@ class ActivationPasses:
             -(-line.before.points.count // 64),
             samples=self._samples.uniform("line", line.sampling),
             acceleration=self.pool.varying("acceleration", write),
-            biases_before=line.before.biases,
-            biases_after=line.after.biases,
+            biases_before=line.before.heads.biases,
+            biases_after=line.after.heads.biases,
             geometry=geometry,
             means=drawn.means,
             scales=drawn.scales,
@@ -165,7 +165,7 @@ class ActivationPasses:
         return {"MOVING": moving, "OPACITY": moving and self._config.appearance_size > 3}
 
     def _moving(self, decoding: Decoding | None) -> dict[str, DeviceArray]:
-        return {} if decoding is None else {"biases": decoding.biases, "outputs": decoding.outputs}
+        return {} if decoding is None else {"biases": decoding.heads.biases, "outputs": decoding.outputs}
 
     def _color(self, decoding: Decoding | None) -> dict[str, DeviceArray]:
         """What the colors are changed by."""

@@ -15,7 +15,7 @@ from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.config import FieldConfig, static_grid, temporal_grids
 from lapgs_wgpu.motion.passes.decoder_passes import DecoderPasses
-from lapgs_wgpu.motion.passes.field_weights import FieldWeights, Time
+from lapgs_wgpu.motion.passes.field_weights import FieldWeights, Heads, Time
 from lapgs_wgpu.motion.passes.hash_encoder_passes import HashEncoderPasses, PointSet
 from lapgs_wgpu.motion.passes.samples import SamplePasses, Samples, Sampling
 
@@ -45,8 +45,7 @@ class Decoding(NamedTuple):
         sampling: gives those of the Gaussians; None for all, in their order.
         points: of the encoder.
         inputs: of the decoder.
-        weights: packed, of the decoder.
-        heads: the packed array that the weights of the heads are in.
+        heads: at that time.
         outputs: (count, outputs) of the heads, without their biases; before `backward` they become their gradient.
     """
 
@@ -55,14 +54,8 @@ class Decoding(NamedTuple):
     sampling: Sampling | None
     points: PointSet
     inputs: dict[str, DeviceArray]
-    weights: dict[str, DeviceArray]
-    heads: DeviceArray
+    heads: Heads
     outputs: DeviceArray
-
-    @property
-    def biases(self) -> DeviceArray:
-        """Of the heads, as activate.wgsl binds them."""
-        return self.weights["biases"]
 
 
 class Comparison(NamedTuple):
@@ -81,22 +74,16 @@ class GridFieldPasses:
     def __init__(self, device: Device, config: FieldConfig) -> None:
         self.config = config
         self.weights = FieldWeights(device, config)
-        self.shape = self.weights.shape
         self.pool = BufferPool(device)
         self.samples = SamplePasses(device, self.pool)
         grids = [[static_grid(config)], temporal_grids(config)]
         self._encoders = [HashEncoderPasses(device, group, config.bound) for group in grids if group]
         self._grids = [len(group) for group in grids if group]
         self._features = [sum(grid.features for grid in group) for group in grids if group]
-        self._now, self._sampled = (DecoderPasses(device, self.shape) for _ in range(2))
+        self._now, self._sampled = (DecoderPasses(device, self.weights) for _ in range(2))
         self._device = device
-        self._layers: DeviceArray | None = None
 
     # Forward ---------------------------------------------------------------------------------------------------------
-
-    def begin(self, commands: Commands, arrays: FieldArrays) -> None:
-        """Record what all times of a step share, before the first `decode`."""
-        self._layers = self.weights.pack_layers(commands, arrays.weights)
 
     def decode(
         self, commands: Commands, number: int, arrays: FieldArrays, t: Time, sampling: Sampling | None = None
@@ -105,7 +92,6 @@ class GridFieldPasses:
 
         number: distinguishes the times that are submitted together, from 0 on.
         """
-        assert self._layers is not None
         name, every = f"decoded {number}", sampling is None
         count = arrays.geometry.shape[0]
         chosen = sampling or partial(Samples, count, count)
@@ -115,12 +101,11 @@ class GridFieldPasses:
         if sampling is not None:
             beside = self.pool.array(f"beside {number}", (points.count, beside.shape[1]))
             self.samples.rows(commands, f"set {number}", sampling, arrays.beside, beside, back=False)
-        heads = self.weights.pack_heads(commands, arrays.weights, name, t)
-        weights = self.weights.segments(self._layers, heads)
-        inputs = dict(zip(self.shape.inputs, [beside, *encodings], strict=True))
-        outputs = self.pool.array(f"outputs {number}", (points.count, self.shape.outputs))
-        self._decoder(sampling).decode(commands, inputs, weights, outputs)
-        return Decoding(name, t, sampling, points, inputs, weights, heads, outputs)
+        heads = self.weights.heads_at(commands, arrays.weights, name, t)
+        inputs = dict(zip(("beside", "static", "temporal"), [beside, *encodings], strict=False))
+        outputs = self.pool.array(f"outputs {number}", (points.count, self.weights.outputs))
+        self._decoder(sampling).decode(commands, inputs, arrays.weights, heads, outputs)
+        return Decoding(name, t, sampling, points, inputs, heads, outputs)
 
     def compare(
         self, commands: Commands, number: int, arrays: FieldArrays, t: Time, near: Sampling, near_time: Time
@@ -150,35 +135,32 @@ class GridFieldPasses:
 
     # Backward --------------------------------------------------------------------------------------------------------
 
-    def decode_bwd(
-        self, commands: Commands, decoding: Decoding, arrays: FieldArrays, gradients: FieldArrays, *, first: bool
-    ) -> None:
+    def decode_bwd(self, commands: Commands, decoding: Decoding, arrays: FieldArrays, gradients: FieldArrays) -> None:
         """Record the backward pass, from the outputs, which have become their gradient.
 
-        The gradient of `beside` is written for all Gaussians, and added for samples. first: whether it is the first
-        such call of a step.
+        The gradient of `beside` is written for all Gaussians, and added for samples.
         """
         d_beside = gradients.beside
         if decoding.sampling is not None:
             d_beside = self.pool.array("d_beside", decoding.inputs["beside"].shape)
-        d_layers, d_heads = self.weights.layers("gradient"), self.weights.heads("gradient")
-        d_weights = self.weights.gradient_segments(d_layers, d_heads)
+        d_heads = self.weights.heads("gradient")
         self._decoder(decoding.sampling).decode_bwd(
             commands,
             decoding.inputs,
-            decoding.weights,
+            arrays.weights,
+            decoding.heads,
             decoding.outputs,
             decoding.inputs | {"beside": d_beside},
-            d_weights,
-            add=not first,
+            gradients.weights,
+            d_heads,
         )
         if decoding.sampling is not None:
             number = decoding.points.number
             self.samples.rows(commands, f"set {number}", decoding.sampling, gradients.beside, d_beside, back=True)
-        encodings = [decoding.inputs[name] for name in self.shape.inputs if name != "beside"]
+        encodings = [array for name, array in decoding.inputs.items() if name != "beside"]
         self._encode_bwd(commands, decoding.points, encodings, gradients.tables)
         place = arrays.weights, gradients.weights, d_heads, decoding.name, decoding.time
-        self.weights.unpack_heads(commands, *place)
+        self.weights.heads_bwd(commands, *place)
 
     def compare_bwd(
         self, commands: Commands, comparison: Comparison, gradients: FieldArrays, weights: list[float]
@@ -192,10 +174,6 @@ class GridFieldPasses:
             commands.dispatch(kernel, groups, smoothness=uniform, here=here, there=there)
         for points, encodings in zip(comparison.points, (comparison.here, comparison.there), strict=True):
             self._encode_bwd(commands, points, encodings, gradients.tables)
-
-    def end(self, commands: Commands, gradients: FieldArrays) -> None:
-        """Record what all times of a step share, after the last `decode_bwd`."""
-        self.weights.unpack_layers(commands, gradients.weights, self.weights.layers("gradient"))
 
     # Parts -----------------------------------------------------------------------------------------------------------
 
