@@ -31,8 +31,8 @@ from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.objective import Sample
-from lapgs_wgpu.train.resident_step import Pending
-from lapgs_wgpu.train.resident_task import ResidentSample, Task
+from lapgs_wgpu.train.resident_step import Flying
+from lapgs_wgpu.train.resident_task import Task
 from lapgs_wgpu.train.run_folder import load_state
 from lapgs_wgpu.train.step_result import Scheduled, StepResult
 from lapgs_wgpu.train.trainer import Trainer
@@ -78,12 +78,12 @@ def disturb(trainer: Trainer) -> None:
 def by_resident(trainer: Trainer, task: Task) -> dict[str, Tensor]:
     step = trainer._resident
     step._push()
-    step._told(step._submit(task, Pending(step.settle), judged=True))
+    step._told(step._submit(Flying(task, step.settle), judged=True))
     gradients = {**step.parameters.gradients(), **step._passes.corrections.gradients()}
     return {name: tensors[0] for name, tensors in gradients.items()}
 
 
-def by_torch(trainer: Trainer, sample: ResidentSample, *, moving: bool) -> dict[str, Tensor]:
+def by_torch(trainer: Trainer, sample: Task, *, moving: bool) -> dict[str, Tensor]:
     nearby = times = None
     smooth = trainer.config.smoothness
     if sample.near is not None:
@@ -113,9 +113,8 @@ def test_gradients_are_those_of_torch(device: Device, dataset: Dataset, kind: st
         disturb(trainer)
     resident = trainers[0]._resident
     task = resident._task(Scheduled(4, moving, 1.0, seen=True), 2)
-    sample = task.sample
-    assert (sample.near is not None) == (sample.even is not None) == moving
-    mine, expected = by_resident(trainers[0], task), by_torch(trainers[1], sample, moving=moving)
+    assert (task.near is not None) == (task.even is not None) == moving
+    mine, expected = by_resident(trainers[0], task), by_torch(trainers[1], task, moving=moving)
     assert mine.keys() == expected.keys()
     # SwiftShader's exp is off by more, which the losses' signs of small differences make larger.
     bounds = {"SwiftShader": 1e-3, "llvmpipe": 1e-5}
