@@ -63,7 +63,7 @@ class RadixSort:
         count_kernel = Kernel.get(self._device, "sort_count", LANE_RUNS=self._lane_runs)
         for step in range(passes):
             uniform = self._pool.constant(
-                f"{self._name} pass {step}",
+                f"{self._name} by {bits} bits, {step}",
                 count_kernel.uniform("Sort", shift=step * width, digits=digits, owners=owners, capacity=capacity),
             )
             arrays = {"sort": uniform, "length": length, "keys": keys}

@@ -71,12 +71,10 @@ class Rasterizer:
 
         gradient: whether `backward` may follow.
         """
-        drawing = self._begin(gaussians, camera, background, depth=depth, gradient=gradient)
-        for band in range(drawing.plan.bands):
-            with Commands(self.device) as commands:
-                drawing.lists = self._draw_band(commands, drawing, band)
-            if self._subgroup_mismatch("rasterize", drawing):
-                return self.draw(gaussians, camera, background, depth=depth, gradient=gradient)
+        with Commands(self.device) as commands:
+            drawing = self.record(commands, gaussians, camera, background, depth=depth, gradient=gradient)
+        if self._subgroup_mismatch("rasterize", drawing):
+            return self.draw(gaussians, camera, background, depth=depth, gradient=gradient)
         return drawing
 
     def record(
@@ -86,31 +84,19 @@ class Rasterizer:
         camera: Camera,
         background: tuple[float, float, float],
         move: Callable[[Commands, DeviceArray, int], DeviceArray] | None = None,
-    ) -> Drawing:
-        """Record the passes that draw an image whose gradient `record_bwd` will want, among others that are submitted
-        together. `draw` and `backward` were called before, which check the driver's subgroups. move: of the Drawing."""
-        drawing = self._begin(gaussians, camera, background, depth=False, gradient=True)
-        drawing.move = move
-        for band in range(drawing.plan.bands):
-            drawing.lists = self._draw_band(commands, drawing, band)
-        return drawing
-
-    def _begin(
-        self,
-        gaussians: Gaussians[DeviceArray],
-        camera: Camera,
-        background: tuple[float, float, float],
         *,
-        depth: bool,
-        gradient: bool,
+        depth: bool = False,
+        gradient: bool = True,
     ) -> Drawing:
+        """Record the passes that draw an image, once `draw` and `backward` have checked subgroups. move: of the
+        Drawing."""
         self.plans.turn_to((camera.width, camera.height, gradient))
         if self.config.round_splats:
             rows, columns = self._tiles(camera)
             bands = max(self.plans.now.bands, -(-rows // max(1, MAX_BAND_TILES // columns)))
             self.plans.now = replace(self.plans.now, bands=bands)
         self._drawings += 1
-        return Drawing(
+        drawing = Drawing(
             gaussians,
             camera,
             background,
@@ -120,7 +106,12 @@ class Rasterizer:
             image=self.pool.array("image", (5 if depth else 4, camera.height, camera.width)),
             splats=self.pool.array("splats", (len(gaussians), SPLAT_FLOATS)),
             needed=[self.pool.array(f"needed {band}", (3,), "uint32") for band in range(self.plans.now.bands)],
+            move=move,
         )
+        for band in range(drawing.plan.bands):
+            drawing.lists = self._draw_band(commands, drawing, band)
+            commands.flush()
+        return drawing
 
     def plan_of(self, camera: Camera) -> BufferPlan:
         """The plan by which `record` draws this camera's image next."""
@@ -259,22 +250,21 @@ class Rasterizer:
         """
         if not self.holds(drawing):
             raise RuntimeError("backward needs the drawing that was drawn last; its buffers now hold another image")
-        d_splats = self.pool.array("d_splats", (len(drawing.gaussians), SPLAT_FLOATS))
-        for band in range(drawing.plan.bands):
-            with Commands(self.device) as commands:
-                self._backward_band(commands, drawing, band, d_image, d_splats)
-            if self._subgroup_mismatch("rasterize_bwd", drawing):
-                return self.backward(self._drawn_again(drawing), d_image, camera=camera)
         with Commands(self.device) as commands:
-            return self._project_bwd(commands, drawing, d_splats, camera=camera)
+            gradients = self.record_bwd(commands, drawing, d_image, camera=camera)
+        if self._subgroup_mismatch("rasterize_bwd", drawing):
+            return self.backward(self._drawn_again(drawing), d_image, camera=camera)
+        return gradients
 
     def record_bwd(
         self, commands: Commands, drawing: Drawing, d_image: DeviceArray, *, camera: bool
     ) -> GaussianGradients:
-        """Record the backward passes of a drawing that `record` has recorded last; arguments as for `backward`."""
+        """Record the backward passes of the drawing that `record` has recorded last; arguments as for `backward`."""
         d_splats = self.pool.array("d_splats", (len(drawing.gaussians), SPLAT_FLOATS))
+        commands.clear(d_splats)
         for band in range(drawing.plan.bands):
             self._backward_band(commands, drawing, band, d_image, d_splats)
+            commands.flush()
         return self._project_bwd(commands, drawing, d_splats, camera=camera)
 
     def _project_bwd(
@@ -303,16 +293,14 @@ class Rasterizer:
 
     def _drawn_again(self, drawing: Drawing) -> Drawing:
         """Return the same image, drawn with the present config."""
-        while True:
-            again = self.draw(drawing.gaussians, drawing.camera, drawing.background, depth=drawing.depth, gradient=True)
-            if not self.grow_on_overflow(again):
-                return again
+        gaussians, camera, background, depth = drawing.gaussians, drawing.camera, drawing.background, drawing.depth
+        while self.grow_on_overflow(again := self.draw(gaussians, camera, background, depth=depth, gradient=True)):
+            pass
+        return again
 
     def _backward_band(
         self, commands: Commands, drawing: Drawing, band: int, d_image: DeviceArray, d_splats: DeviceArray
     ) -> None:
-        if band == 0:
-            commands.clear(d_splats)
         if drawing.plan.bands > 1:  # the lists of the other bands are gone
             drawing.lists = self._draw_band(commands, drawing, band)
         lists, plan = drawing.lists, drawing.plan
