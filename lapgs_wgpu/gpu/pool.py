@@ -13,6 +13,8 @@ from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import Device
 
+_MOST_CONSTANTS = 1024  # of a pool: those of earlier sizes accumulate
+
 
 class BufferPool:
     """Buffers by name, which grow and never shrink: a training step allocates nothing in steady state.
@@ -23,7 +25,8 @@ class BufferPool:
     def __init__(self, device: Device) -> None:
         self.device = device
         self._buffers: dict[str, Buffer] = {}
-        self._constants: dict[str, bytes] = {}
+        self._constants: dict[bytes, DeviceArray] = {}
+        self._written: dict[str, bytes] = {}
 
     def array(self, name: str, shape: tuple[int, ...], dtype: str = "float32") -> DeviceArray:
         """Return an array at the start of the named buffer, whose content is lost if it has to grow."""
@@ -40,24 +43,31 @@ class BufferPool:
         array.write(values)
         return array
 
-    def constant(self, name: str, content: bytes) -> DeviceArray:
-        """Return a small array with this content, written only when it changes.
-
-        The content must not change between recording and submission of a command that reads it.
-        """
+    def constant(self, content: bytes) -> DeviceArray:
+        """Return a small array with this content, the same one each time."""
         if self.device.recording is not None:
             return self.device.recording.constant(content)
-        array = self.array(f"constant {name}", (len(content),), "uint8")
-        if self._constants.get(name) != content:
-            array.write(np.frombuffer(content, np.uint8))
-            self._constants[name] = content
-        return array
+        if content not in self._constants:
+            if len(self._constants) >= _MOST_CONSTANTS:
+                self._constants.clear()
+            array = DeviceArray.upload(self.device, "constant", np.frombuffer(content, np.uint8))
+            self._constants[content] = array
+        return self._constants[content]
 
     def varying(self, name: str, write: Callable[[], bytes]) -> DeviceArray:
-        """A constant whose content, which `write` gives, differs from one replay of a recording to the next."""
+        """Return a small array with the content that `write` gives, which is written over in the next call.
+
+        The content must not change between recording and submission of a command that reads it; replays of a recording
+        ask for it anew.
+        """
         if self.device.recording is not None:
             return self.device.recording.varying((self, name), write)
-        return self.constant(name, write())
+        content = write()
+        array = self.array(f"varying {name}", (len(content),), "uint8")
+        if self._written.get(name) != content:
+            array.write(np.frombuffer(content, np.uint8))
+            self._written[name] = content
+        return array
 
     @property
     def nbytes(self) -> int:

@@ -62,10 +62,8 @@ class RadixSort:
         groups = owners // 8 if self._lane_runs else owners
         count_kernel = Kernel.get(self._device, "sort_count", LANE_RUNS=self._lane_runs)
         for step in range(passes):
-            uniform = self._pool.constant(
-                f"{self._name} by {bits} bits, {step}",
-                count_kernel.uniform("Sort", shift=step * width, digits=digits, owners=owners, capacity=capacity),
-            )
+            sizes = {"shift": step * width, "digits": digits, "owners": owners, "capacity": capacity}
+            uniform = self._pool.constant(count_kernel.uniform("Sort", **sizes))
             arrays = {"sort": uniform, "length": length, "keys": keys}
             commands.dispatch(count_kernel, groups, counters=counters, **arrays)
             places = counters if unsummed else self._summed(commands, counters)
@@ -82,6 +80,6 @@ class RadixSort:
         (count,) = counters.shape
         places = self._pool.array(f"{self._name} places", (count,), "uint32")
         total = self._pool.array(f"{self._name} total", (1,), "uint32")
-        length = self._pool.constant(f"{self._name} counter count", struct.pack("<I", count))
+        length = self._pool.constant(struct.pack("<I", count))
         self._scan(commands, length=length, capacity=count, values=counters, prefix=places, total=total)
         return places

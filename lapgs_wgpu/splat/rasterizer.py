@@ -162,7 +162,7 @@ class Rasterizer:
         )
         tile_keys, slot_ids = (pool.array(name, (capacity,), "uint32") for name in ("tile keys", "slot ids"))
         ranges = pool.array("ranges", (tiles + 1, 4), "uint32")
-        length = pool.constant("gaussians", n.to_bytes(4, "little"))
+        length = pool.constant(n.to_bytes(4, "little"))
         arrays = gaussians.arrays() | {"frame": frame, "needed": needed}
         arrays |= {"splats": drawing.splats, "image": drawing.image}
         arrays |= {"tile_counts": tile_counts, "ids": ids, "keys": keys, "prefix": offsets, "visible": visible}
@@ -314,11 +314,11 @@ class Rasterizer:
         arrays = lists._asdict() | {"ids": lists.sorted_ids, "frame": drawing.frames[band]}
         arrays |= {"splats": drawing.splats, "image": drawing.image, "d_image": d_image, "d_splats": d_splats}
         arrays |= {"records": records, "record_tails": record_tails}
-        arrays["tails"] = self.pool.constant("tails", gather.uniform("Tails", capacity=plan.capacity))
+        arrays["tails"] = self.pool.constant(gather.uniform("Tails", capacity=plan.capacity))
         commands.clear(record_tails.rows(0, plan.capacity))  # no slot has a record yet
         for number in range(plan.rounds):
             if plan.rounds > 1:
                 uniform = kernel.uniform("Piece", number=number, state=tails)
-                arrays["piece"] = self.pool.constant(f"piece {number}", uniform)
+                arrays["piece"] = self.pool.constant(uniform)
             commands.run(kernel, self._band_tiles(drawing, band), arrays)
         commands.run(gather, _groups(len(drawing.gaussians)), arrays)

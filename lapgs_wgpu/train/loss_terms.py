@@ -124,10 +124,11 @@ class WgslLoss:
         values = pool.array("values", (height, width))
         commands.clear(values)
         share = weight / (height * width)
-        uniform = kernel.uniform("Term", size=(width, height), share=share, padding=0.0, background=background)
+        given = {"size": (width, height), "share": share, "padding": 0.0, "background": background}
+        uniform = pool.varying("term", lambda: kernel.uniform("Term", **given))
         groups = -(-width // SIDE), -(-height // SIDE)
         arrays = {"image": image, "rgba": own, "d_image": d_image, "values": values}
-        commands.dispatch_grid(kernel, groups, term=pool.constant("term", uniform), **arrays)
+        commands.dispatch_grid(kernel, groups, term=uniform, **arrays)
         return values
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import torch
 from torch import Tensor
 
@@ -117,7 +115,7 @@ class ResidentCorrections:
         if self._exposures is None:
             return d_exposed
         back = self._exposing.record_bwd(commands, image, d_exposed, self._value("exposures"), self._first_row)
-        sum_columns(commands, self._pool, "exposure", back.d_rows, self._d_exposure, columns=12)
+        sum_columns(commands, self._pool, back.d_rows, self._d_exposure, columns=12)
         return back.d_image
 
     def sum_camera(self, commands: Commands, sums: DeviceArray | None) -> None:
@@ -125,13 +123,13 @@ class ResidentCorrections:
         if sums is None or self._cameras is None:
             return
         for half, factor in enumerate((-1.0, -self._cameras.extent)):
-            name, rows, total = f"camera {half}", sums.rows(half, 1), self._d_camera
-            sum_columns(commands, self._pool, name, rows, total, columns=4, place=4 * half, factor=factor)
+            rows, total = sums.rows(half, 1), self._d_camera
+            sum_columns(commands, self._pool, rows, total, columns=4, place=4 * half, factor=factor)
 
     def record_check(self, commands: Commands, bad: DeviceArray) -> None:
         """Record the search for gradients that are not finite."""
-        for name, gradient in self._gradients():
-            check_finite(commands, self._pool, name, gradient, bad)
+        for gradient in self._gradients().values():
+            check_finite(commands, self._pool, gradient, bad)
 
     def record_step(self, commands: Commands, guard: DeviceArray, frame: DeviceArray, geometry: DeviceArray) -> None:
         """Record a step of the corrections, after the one of the Gaussians. frame: that `move` gave; geometry: (N, 12)
@@ -154,7 +152,7 @@ class ResidentCorrections:
         assert cameras is not None
         motion, motion_kernel = self._pool.array("motion", (_MOTION_FLOATS,)), Kernel.get(self._device, "image_motion")
         content = motion_kernel.uniform("Seen", gaussians=count, spacing=-(-count // MOST_POINTS), unit=cameras.extent)
-        seen = self._pool.constant("seen", content)
+        seen = self._pool.constant(content)
         commands.dispatch(motion_kernel, 1, seen=seen, frame=frame, geometry=geometry, motion=motion)
         kernel = Kernel.get(self._device, "camera_step")
 
@@ -169,13 +167,11 @@ class ResidentCorrections:
 
     def gradients(self) -> dict[str, list[Tensor]]:
         """Of the view's corrections, read back; for the text of an error."""
-        return {name: [torch.from_numpy(gradient.read())] for name, gradient in self._gradients()}
+        return {name: [torch.from_numpy(gradient.read())] for name, gradient in self._gradients().items()}
 
-    def _gradients(self) -> Iterator[tuple[str, DeviceArray]]:
-        if self.moves_camera:
-            yield "cameras", self._d_camera
-        if self._exposures is not None:
-            yield "exposures", self._d_exposure
+    def _gradients(self) -> dict[str, DeviceArray]:
+        found = {"cameras": self._d_camera} if self.moves_camera else {}
+        return found | ({"exposures": self._d_exposure} if self._exposures is not None else {})
 
     def _value(self, name: str) -> DeviceArray:
         return self._blocks[name][0].arrays["value"]

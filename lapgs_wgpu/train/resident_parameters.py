@@ -253,7 +253,7 @@ class ResidentParameters:
     def record_check(self, commands: Commands, bad: DeviceArray, *, moving: bool) -> None:
         """Record the search for gradients that are not finite."""
         for part in PARTS if moving else PARTS[:1]:
-            check_finite(commands, self._pool, part, self._arrays[part, "gradient"], bad)
+            check_finite(commands, self._pool, self._arrays[part, "gradient"], bad)
 
     def count_step(self, *, moving: bool) -> None:
         """A step that moves the parameters is about to be recorded."""
@@ -291,7 +291,7 @@ class ResidentParameters:
             content = kernel.uniform("Adam", count=count, columns=block.rate_columns, first=first)
             first += block.rate_columns
             arrays = {name: block.arrays[name[:-1]] for name in ("gradients", "values", "means", "squares")}
-            adam = self._pool.constant(f"adam {block.name}", content)
+            adam = self._pool.constant(content)
             commands.dispatch(kernel, -(-count // 256), adam=adam, guard=guard, rates=rates, **arrays)
         if moving and self._frequencies is not None:
             self._record_frequencies(commands, guard, frequency_rate)
@@ -324,12 +324,12 @@ class ResidentParameters:
         return {name: [tensor] for name, tensor in tensors.items()}
 
 
-def check_finite(commands: Commands, pool: BufferPool, name: str, values: DeviceArray, bad: DeviceArray) -> None:
-    """Record that `bad` becomes odd where a value is not finite. name: of the uniform in the pool."""
+def check_finite(commands: Commands, pool: BufferPool, values: DeviceArray, bad: DeviceArray) -> None:
+    """Record that `bad` becomes odd where a value is not finite."""
     kernel, most = Kernel.get(commands.device, "check_finite"), commands.device.max_binding // 1024 * 256
     for first in range(0, values.size, most):
         part = DeviceArray(values.buffer, (min(most, values.size - first),), offset=values.offset + 4 * first)
-        uniform = pool.constant(f"check {name} {first}", kernel.uniform("Check", count=part.size))
+        uniform = pool.constant(kernel.uniform("Check", count=part.size))
         commands.dispatch(kernel, -(-part.size // 1024), check=uniform, values=part, bad=bad)
 
 

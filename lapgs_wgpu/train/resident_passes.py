@@ -206,7 +206,7 @@ class ResidentPasses:
 
     def _total(self, commands: Commands, values: DeviceArray, name: str, factor: float, totals: DeviceArray) -> None:
         """Record the sum of values, times a factor, in the place of this name."""
-        sum_columns(commands, self._pool, name, values, totals, place=TOTALS.index(name), factor=factor)
+        sum_columns(commands, self._pool, values, totals, place=TOTALS.index(name), factor=factor)
 
     def _dynamics(self, commands: Commands, rows: DeviceArray, d_rows: DeviceArray, totals: DeviceArray) -> None:
         """Record the loss of the dynamics attributes and its gradient (motion/fields/dynamics)."""
@@ -218,7 +218,7 @@ class ResidentPasses:
         sizes = {"gaussians": n, "columns": stride - 1, "stride": stride, "weight": self._config.loss.dynamics}
         for name in ("dynamics_mean", "dynamics_distances", "dynamics_deviation", "dynamics_bwd"):
             kernel = Kernel.get(self._device, name, GROUPS=_DYNAMICS_GROUPS)
-            arrays["dynamics"] = self._pool.constant("dynamics", kernel.uniform("Dynamics", **sizes))
+            arrays["dynamics"] = self._pool.constant(kernel.uniform("Dynamics", **sizes))
             commands.run(kernel, _DYNAMICS_GROUPS, arrays)
         self._total(commands, arrays["losses"], "dynamics", 1.0, totals)
 
@@ -236,7 +236,7 @@ class ResidentPasses:
         moving, count, guard, bad = task.scheduled.moving, len(self._scene), self.word("guard"), self.word("bad")
         self.parameters.record_check(commands, bad, moving=moving)
         self.corrections.record_check(commands, bad)
-        check_finite(commands, self._pool, "terms", terms, bad)
+        check_finite(commands, self._pool, terms, bad)
         close = Kernel.get(self._device, "close_guard")
         given = {"capacity": drawing.plan.capacity, "rounds": int(bool(self.rasterizer.config.round_splats))}
         guarded = self._pool.varying(
@@ -250,7 +250,7 @@ class ResidentPasses:
             kernel, camera = Kernel.get(self._device, "accumulate_statistics"), task.view.camera
             content = kernel.uniform("Seen", half_size=(camera.width / 2, camera.height / 2), gaussians=count)
             arrays = {"splats": drawing.splats, "d_splats": by_drawn.splats, "statistics": self.seen()}
-            seen = self._pool.constant("seen", content)
+            seen = self._pool.constant(content)
             commands.dispatch(kernel, -(-count // 64), seen=seen, guard=guard, **arrays)
         rates = (lambda: self._task.rates), (lambda: self._task.frequency_rate)
         self.parameters.record_adam(commands, guard, *rates, moving=moving)

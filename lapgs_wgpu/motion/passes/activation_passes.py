@@ -149,7 +149,7 @@ class ActivationPasses:
         else:
             kernel = Kernel.get(self._device, name, MOVING=decoding is not None, OPACITY=appearance > 3)
             uniform = {"activation": kernel.uniform("Activate", mirror=self._mirror, **sizes)}
-        given = arrays | {key: self.pool.constant(key, content) for key, content in uniform.items()}
+        given = arrays | {key: self.pool.constant(content) for key, content in uniform.items()}
         commands.run(kernel, -(-count * (SH_FLOATS if harmonics else 1) // 64), given)
 
     def _moving(self, decoding: Decoding | None) -> dict[str, DeviceArray]:

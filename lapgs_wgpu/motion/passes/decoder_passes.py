@@ -65,7 +65,7 @@ class DecoderPasses:
         for first, count in self._blocks(outputs):
             _, features = self._activate(commands, first, count, inputs, weights)
             target = Matrix.of(outputs.rows(first, count))
-            self._product(commands, f"outputs {first}", features, Matrix.of(heads.weights).transpose, target)
+            self._product(commands, features, Matrix.of(heads.weights).transpose, target)
 
     def decode_bwd(
         self,
@@ -86,17 +86,17 @@ class DecoderPasses:
             d, more = Matrix.of(d_outputs.rows(first, count)), first > 0
             ones = Matrix.of(inputs["beside"].rows(first, count)).from_column(ones_column, 1)
             d_biases = Matrix(d_heads.biases, self._of.outputs, 1, 1)
-            split(commands, f"d heads {first}", d.transpose, features, Matrix.of(d_heads.weights), add=more)
-            split(commands, f"d head biases {first}", d.transpose, ones, d_biases, add=more)
-            self._product(commands, f"d features {first}", d, Matrix.of(heads.weights), features)
+            split(commands, d.transpose, features, Matrix.of(d_heads.weights), add=more)
+            split(commands, d.transpose, ones, d_biases, add=more)
+            self._product(commands, d, Matrix.of(heads.weights), features)
             self._gate("gate_bwd", commands, count, weights, d_features=features.array, layers=layers.array)
             d_biases = self._of.matrix(d_weights, "spatial.bias", self._of.channels, 1)
-            split(commands, f"d biases {first}", layers.transpose, ones, d_biases, add=True)
+            split(commands, layers.transpose, ones, d_biases, add=True)
             for each in self._products:
                 given, target = self._input(inputs, each, first, count), self._input(d_inputs, each, first, count)
                 own, d_own = layers.from_column(each.channel, each.channels), self._weights(d_weights, each)
-                split(commands, f"d weights {each.name} {first}", own.transpose, given, d_own, add=True)
-                self._product(commands, f"d {each.name} {first}", own, self._weights(weights, each), target)
+                split(commands, own.transpose, given, d_own, add=True)
+                self._product(commands, own, self._weights(weights, each), target)
 
     def _input(self, inputs: Mapping[str, DeviceArray], product: _Product, first: int, count: int) -> Matrix:
         return Matrix.of(inputs[product.input].rows(first, count)).from_column(0, product.columns)
@@ -123,7 +123,7 @@ class DecoderPasses:
         for each in self._products:
             given, of = self._input(inputs, each, first, count), self._weights(weights, each).transpose
             own = layers.from_column(each.channel, each.channels)
-            self._product(commands, f"{each.name} {first}", given, of, own, add=each.channel in begun)
+            self._product(commands, given, of, own, add=each.channel in begun)
             begun.add(each.channel)
         self._gate("gate", commands, count, weights, layers=layers.array, features=features.array)
         return layers, features
@@ -131,5 +131,5 @@ class DecoderPasses:
     def _gate(self, name: str, commands: Commands, count: int, weights: DeviceArray, **arrays: DeviceArray) -> None:
         kernel, first = Kernel.get(self.device, name, MOTION=self._of.motion), self._of.places["spatial.bias"].first
         content = kernel.uniform("Gate", gaussians=count, width=self._of.width, biases=first)
-        uniform = self.pool.constant(f"gate {count}", content)
+        uniform = self.pool.constant(content)
         commands.dispatch(kernel, -(-count * self._of.width // 64), gate=uniform, weights=weights, **arrays)

@@ -214,4 +214,4 @@ class GridFieldPasses:
     def _smoothness(self, group: int, pairs: int, scale: float) -> DeviceArray:
         kernel = Kernel.get(self._device, "smoothness")
         content = kernel.uniform("Smoothness", pairs=pairs, features=self._features[group], scale=scale)
-        return self.pool.constant(f"smoothness {group} {'back' if scale else 'forth'}", content)
+        return self.pool.constant(content)

@@ -114,7 +114,7 @@ class HashEncoderPasses:
         kernel, name = Kernel.get(self.device, "hashgrid_slice"), f"grid {points.number} from {first} by {most}"
         sizes = {"points": count, "all_points": points.count, "all_levels": self._row // 2}
         if not self._timed:
-            return self.pool.constant(name, kernel.uniform("Grid", time=0.0, bound=self.bound, **sizes))
+            return self.pool.constant(kernel.uniform("Grid", time=0.0, bound=self.bound, **sizes))
         return self.pool.varying(name, lambda: kernel.uniform("Grid", time=points.time(), bound=self.bound, **sizes))
 
     def _blocks(

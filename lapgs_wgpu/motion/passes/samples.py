@@ -66,7 +66,7 @@ class SamplePasses:
             kernel,
             -(-chosen.size // 64),
             samples=self.uniform(name, sampling),
-            row=self._pool.constant(f"row {columns}", kernel.uniform("Row", columns=columns)),
+            row=self._pool.constant(kernel.uniform("Row", columns=columns)),
             chosen=chosen,
             all=every,
         )
