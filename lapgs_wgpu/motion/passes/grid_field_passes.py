@@ -6,7 +6,6 @@ Everything stays in device arrays. Gradients are added to arrays that the caller
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
 from lapgs_wgpu.gpu.array import DeviceArray
@@ -68,6 +67,14 @@ class Comparison(NamedTuple):
     sums: list[DeviceArray]
 
 
+class _Group(NamedTuple):
+    """Grids that are encoded together. tables: theirs among all; features: of a point."""
+
+    encoder: HashEncoderPasses
+    tables: slice
+    features: int
+
+
 class GridFieldPasses:
     """Records the passes of a field that `decodes_on_device`."""
 
@@ -76,11 +83,12 @@ class GridFieldPasses:
         self.weights = FieldWeights(device, config)
         self.pool = BufferPool(device)
         self.samples = SamplePasses(device, self.pool)
-        grids = [[static_grid(config)], temporal_grids(config)]
-        self._encoders = [HashEncoderPasses(device, group, config.bound) for group in grids if group]
-        self._grids = [len(group) for group in grids if group]
-        self._features = [sum(grid.features for grid in group) for group in grids if group]
-        self._now, self._sampled = (DecoderPasses(device, self.weights) for _ in range(2))
+        static, temporal = static_grid(config), temporal_grids(config)
+        self._groups = [_Group(HashEncoderPasses(device, [static], config.bound), slice(1), static.features)]
+        if temporal:
+            encoder = HashEncoderPasses(device, temporal, config.bound)
+            self._groups.append(_Group(encoder, slice(1, None), self.weights.temporal))
+        self._decoder = DecoderPasses(device, self.weights)
         self._device = device
 
     # Forward ---------------------------------------------------------------------------------------------------------
@@ -92,10 +100,8 @@ class GridFieldPasses:
 
         number: distinguishes the times that are submitted together, from 0 on.
         """
-        name, every = f"decoded {number}", sampling is None
-        count = arrays.geometry.shape[0]
-        chosen = sampling or partial(Samples, count, count)
-        points = self._points(commands, number, chosen, arrays, t, every=every)
+        name = f"decoded {number}"
+        points = self._points(commands, number, sampling, arrays, t)
         encodings = self._encode(commands, points, arrays.tables)
         beside = arrays.beside
         if sampling is not None:
@@ -104,7 +110,7 @@ class GridFieldPasses:
         heads = self.weights.heads_at(commands, arrays.weights, name, t)
         inputs = dict(zip(("beside", "static", "temporal"), [beside, *encodings], strict=False))
         outputs = self.pool.array(f"outputs {number}", (points.count, self.weights.outputs))
-        self._decoder(sampling).decode(commands, inputs, arrays.weights, heads, outputs)
+        self._decoder.decode(commands, inputs, arrays.weights, heads, outputs)
         return Decoding(name, t, sampling, points, inputs, heads, outputs)
 
     def compare(
@@ -144,23 +150,15 @@ class GridFieldPasses:
         if decoding.sampling is not None:
             d_beside = self.pool.array("d_beside", decoding.inputs["beside"].shape)
         d_heads = self.weights.heads("gradient")
-        self._decoder(decoding.sampling).decode_bwd(
-            commands,
-            decoding.inputs,
-            arrays.weights,
-            decoding.heads,
-            decoding.outputs,
-            decoding.inputs | {"beside": d_beside},
-            gradients.weights,
-            d_heads,
-        )
+        inputs, d_weights = decoding.inputs, gradients.weights
+        given = inputs, arrays.weights, decoding.heads, decoding.outputs
+        self._decoder.decode_bwd(commands, *given, inputs | {"beside": d_beside}, d_weights, d_heads)
         if decoding.sampling is not None:
             number = decoding.points.number
             self.samples.rows(commands, f"set {number}", decoding.sampling, gradients.beside, d_beside, back=True)
-        encodings = [array for name, array in decoding.inputs.items() if name != "beside"]
+        encodings = [array for name, array in inputs.items() if name != "beside"]
         self._encode_bwd(commands, decoding.points, encodings, gradients.tables)
-        place = arrays.weights, gradients.weights, d_heads, decoding.name, decoding.time
-        self.weights.heads_bwd(commands, *place)
+        self.weights.heads_bwd(commands, arrays.weights, d_weights, d_heads, decoding.name, decoding.time)
 
     def compare_bwd(
         self, commands: Commands, comparison: Comparison, gradients: FieldArrays, weights: list[float]
@@ -170,48 +168,34 @@ class GridFieldPasses:
         kernel = Kernel.get(self._device, "smoothness_bwd")
         for group, (here, there) in enumerate(zip(comparison.here, comparison.there, strict=True)):
             uniform = self._smoothness(group, count, 2 * weights[group])
-            groups = -(-count * self._features[group] // 64)
+            groups = -(-count * self._groups[group].features // 64)
             commands.dispatch(kernel, groups, smoothness=uniform, here=here, there=there)
         for points, encodings in zip(comparison.points, (comparison.here, comparison.there), strict=True):
             self._encode_bwd(commands, points, encodings, gradients.tables)
 
     # Parts -----------------------------------------------------------------------------------------------------------
 
-    def _decoder(self, sampling: Sampling | None) -> DecoderPasses:
-        """Of all Gaussians, or of samples: sets of equal size share one, and with it its buffers."""
-        return self._now if sampling is None else self._sampled
-
     def _points(
-        self,
-        commands: Commands,
-        number: int,
-        sampling: Sampling,
-        arrays: FieldArrays,
-        t: Time,
-        *,
-        every: bool = False,
+        self, commands: Commands, number: int, sampling: Sampling | None, arrays: FieldArrays, t: Time
     ) -> PointSet:
-        array = self.samples.places(commands, f"set {number}", sampling, arrays.geometry, every=every)
+        array = self.samples.places(commands, f"set {number}", sampling, arrays.geometry)
         return PointSet(number, array, array.shape[0], lambda: self.config.grid_time(t()))
 
     def _encode(self, commands: Commands, points: PointSet, tables: list[DeviceArray]) -> list[DeviceArray]:
-        found, rest = [], list(tables)
-        for group, (encoder, grids) in enumerate(zip(self._encoders, self._grids, strict=True)):
-            encoding = self.pool.array(f"encoding {points.number} {group}", (points.count, self._features[group]))
-            encoder.encode(commands, points, rest[:grids], encoding)
-            rest = rest[grids:]
+        found = []
+        for number, (encoder, own, features) in enumerate(self._groups):
+            encoding = self.pool.array(f"encoding {points.number} {number}", (points.count, features))
+            encoder.encode(commands, points, tables[own], encoding)
             found.append(encoding)
         return found
 
     def _encode_bwd(
         self, commands: Commands, points: PointSet, d_encodings: list[DeviceArray], d_tables: list[DeviceArray]
     ) -> None:
-        rest = list(d_tables)
-        for encoder, grids, d_encoding in zip(self._encoders, self._grids, d_encodings, strict=True):
-            encoder.add_gradient(commands, points, d_encoding, rest[:grids])
-            rest = rest[grids:]
+        for (encoder, own, _), d_encoding in zip(self._groups, d_encodings, strict=True):
+            encoder.add_gradient(commands, points, d_encoding, d_tables[own])
 
     def _smoothness(self, group: int, pairs: int, scale: float) -> DeviceArray:
         kernel = Kernel.get(self._device, "smoothness")
-        content = kernel.uniform("Smoothness", pairs=pairs, features=self._features[group], scale=scale)
+        content = kernel.uniform("Smoothness", pairs=pairs, features=self._groups[group].features, scale=scale)
         return self.pool.constant(content)
