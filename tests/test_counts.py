@@ -21,7 +21,7 @@ from lapgs_wgpu.gpu import buffer as buffer_module
 from lapgs_wgpu.gpu import native
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.gpu.radix_sort import FEW_OWNERS, runs
+from lapgs_wgpu.gpu.radix_sort import FEW_RUNS, runs
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.train.config import LossWeights
@@ -129,8 +129,8 @@ def test_dispatches_a_step(device: Device, scene: Scene, truth: DeviceArray, eve
     }
     digits = sum(sorts.values())
     assert names.count("sort_count") == names.count("sort_scatter") == digits
-    # Of few lane runs, the counters are added up without a scan.
-    scans = 2 + sum(each for capacity, each in sorts.items() if not shape.lane_runs or runs(capacity) > FEW_OWNERS)
+    # Of few owners, the counters are added up without a scan.
+    scans = 2 + sum(each for capacity, each in sorts.items() if shape.lane_runs and runs(capacity) > FEW_RUNS)
     assert names.count("scan_apply") == scans
     assert "scan_reduce" not in names  # none has more than a block
     pyramid = [name for name in names if name.startswith("loss_pyramid")]

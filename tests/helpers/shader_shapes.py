@@ -111,7 +111,7 @@ SHAPES: dict[str, Choices] = {
     "smoothness": [{}],
     "smoothness_bwd": [{}],
     "sort_count": _all(*_flags("LANE_RUNS")),
-    "sort_scatter": _all([{}, {"LANE_RUNS": 1}, {"LANE_RUNS": 1, "UNSUMMED": 1}], *_flags("IOTA")),
+    "sort_scatter": _all(*_flags("LANE_RUNS", "UNSUMMED", "IOTA")),
     "spectrum": [{}],
     "spectrum_bwd": [{}],
     "sum_values": [{}],
