@@ -65,8 +65,8 @@ def disturb(trainer: Trainer) -> None:
                 tensor[:5] = -20.0  # below the floor
         if scene.field is not None:
             for name, tensor in sorted(scene.field.named_parameters()):
-                # Uneven enough that the acceleration loss is no direction of a rounding error.
-                size = 2.0 if name.endswith(".table") else 0.2
+                # grid4d must move so unevenly that the acceleration's direction is not that of a rounding error.
+                size = 2.0 if name.endswith(".table") and scene.field.config.kind == "grid4d" else 0.2
                 tensor += size * torch.randn(tensor.shape, generator=generator)
             scene.field.heads.weight *= 0.3
     scene.sh_degree = 2
@@ -117,7 +117,7 @@ def test_gradients_are_those_of_torch(device: Device, dataset: Dataset, kind: st
     mine, expected = by_resident(trainers[0], task), by_torch(trainers[1], task, moving=moving)
     assert mine.keys() == expected.keys()
     # SwiftShader's exp is off by more, which the losses' signs of small differences make larger.
-    bounds = {"SwiftShader": 1e-3, "llvmpipe": 1e-5}
+    bounds = {"SwiftShader": 2e-3, "llvmpipe": 1e-5}
     bound = next((bound for name, bound in bounds.items() if name in device.info.name), 3e-5)
     for name, exact in expected.items():
         if exact.abs().max() == 0:
