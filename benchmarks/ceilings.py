@@ -12,13 +12,13 @@ from unittest import mock
 
 import numpy as np
 from measure import Timing
+from timestamps import Profile
 from work import Work
 
 from lapgs_wgpu.gpu import shader
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.gpu.profile import Profile
 from lapgs_wgpu.splat.raster_config import raster_config
 
 COPY, FMA, EXP = KERNELS = ("ceiling_copy", "ceiling_fma", "ceiling_exp")
@@ -74,7 +74,7 @@ class CeilingKernels:
         profile, groups = Profile(self._device), 16
         while True:
             for _ in range(2):  # the first one may wait for the driver's compiler
-                with Commands(self._device, profile) as commands:
+                with profile.running(), Commands(self._device) as commands:
                     dispatch(groups)(commands)
             if profile.read()[-1][1] > shortest or groups >= 1 << 15:
                 return groups

@@ -22,9 +22,8 @@ from wgpu.backends.wgpu_native import GPUQueue
 from lapgs_wgpu import Trainer
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.synthetic import write_synthetic
+from lapgs_wgpu.gpu import native
 from lapgs_wgpu.gpu.device import Device, _adapters
-from lapgs_wgpu.gpu.kernel import Commands
-from lapgs_wgpu.gpu.native import Encoder
 from lapgs_wgpu.train.presets import load_config
 
 CASES = {  # Gaussians and longer side of the images, pixels
@@ -58,15 +57,12 @@ def null_device() -> Device:
 @contextmanager
 def no_time() -> Iterator[None]:
     """Every dispatch has no workgroups."""
-    dispatch, record = Encoder.dispatch, Commands._record
+    play = native.play
 
-    def nothing(self: Encoder, pipeline: object, group: object, columns: int, rows: int) -> None:
-        dispatch(self, pipeline, group, 0, rows)
+    def nothing(encoder: Any, commands: list[native.Command]) -> None:
+        play(encoder, [(*each[:3], 0, 1) if each[0] == "dispatch" else each for each in commands])
 
-    def nothing_again(self: Commands, kind: str, objects: tuple[Any, ...], *numbers: int) -> None:
-        record(self, kind, objects, *((0, 1) if kind == "dispatch" else numbers))
-
-    with mock.patch.object(Encoder, "dispatch", nothing), mock.patch.object(Commands, "_record", nothing_again):
+    with mock.patch.object(native, "play", nothing):
         yield
 
 

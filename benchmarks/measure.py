@@ -111,12 +111,12 @@ def recording() -> Iterator[list[Event]]:
 
     def counted_mapping(device: Any, buffer: Any, mode: int, offset: int, nbytes: int) -> Any:
         events.append(Event("read", buffer.label, nbytes))  # `array` maps for nothing else
-        return native.mapping(device, buffer, mode, offset, nbytes)
+        return native.Mapping(device, buffer, mode, offset, nbytes)
 
     with (
         mock.patch.object(Commands, "dispatch_grid", counted_dispatch),
         mock.patch.object(Commands, "_submit", counted_submit),
         mock.patch.object(Buffer, "write", counted_write),
-        mock.patch.object(array, "mapping", counted_mapping),
+        mock.patch.object(array, "Mapping", counted_mapping),
     ):
         yield events

@@ -6,15 +6,13 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from unittest import mock
 
 from ceilings import KERNELS, CeilingKernels, Ceilings
 from measure import Timing, summary
+from timestamps import Profile
 from work import Work
 
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.gpu.kernel import Commands
-from lapgs_wgpu.gpu.profile import Profile
 
 
 @dataclass(frozen=True)
@@ -46,12 +44,7 @@ Times = list[tuple[str, float]]  # shader and milliseconds of each dispatch, in 
 def by_timestamps(device: Device) -> Iterator[Times]:
     """A list that holds, afterwards, what the device's own clock says of all that was submitted."""
     profile, times = Profile(device), Times()
-    prepare = Commands.__init__
-
-    def profiled(commands: Commands, device: Device, other: Profile | None = None) -> None:
-        prepare(commands, device, other or profile)
-
-    with mock.patch.object(Commands, "__init__", profiled):
+    with profile.running():
         yield times
     times += profile.read()
 

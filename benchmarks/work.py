@@ -14,7 +14,7 @@ from math import sqrt
 
 from lapgs_wgpu.gpu.array import read_all
 from lapgs_wgpu.gpu.kernel import Commands
-from lapgs_wgpu.gpu.radix_sort import FEW_OWNERS, runs
+from lapgs_wgpu.gpu.radix_sort import FEW_BLOCKS, FEW_RUNS, runs
 from lapgs_wgpu.motion.fields.hash_grid_config import GridShape
 from lapgs_wgpu.splat.drawing import Drawing
 from lapgs_wgpu.splat.rasterizer import Rasterizer
@@ -140,9 +140,11 @@ def _sort_counters(rasterizer: Rasterizer, capacity: int, bits: int) -> _Sort:
     if rasterizer.config.lane_runs:
         passes = -(-bits // 8)
         owners = runs(capacity)
-        scanned = owners > FEW_OWNERS
+        scanned = owners > FEW_RUNS
         return _Sort(passes, (1 << -(-bits // passes)) * owners, scanned, 1 if scanned else owners // 8)
-    return _Sort(-(-bits // 4), 16 * -(-capacity // 2048))
+    owners = -(-capacity // 2048)
+    scanned = owners > FEW_BLOCKS
+    return _Sort(-(-bits // 4), 16 * owners, scanned, 1 if scanned else owners)
 
 
 def encoder_work(grids: Sequence[GridShape], points: int, *, lane_levels: bool) -> dict[str, Work]:

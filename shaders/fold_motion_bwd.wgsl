@@ -1,21 +1,30 @@
-// The gradients of the heads, of the motion's second layer and of the spectrum's channels from those of what `fold_motion`
-// leaves, a channel a workgroup.
+// The gradients of the weights from those of what `fold_motion` leaves, a channel a workgroup. MOTION: also of the motion's
+// second layer and of the spectrum's channels.
 #import common/spectrum
 
 @group(0) @binding(0) var<uniform> spectrum: Spectrum;
-@group(0) @binding(1) var<storage, read> weights: array<f32>;
-@group(0) @binding(2) var<storage, read> series: array<f32>;
-@group(0) @binding(3) var<storage, read> d_heads: array<f32>;            // (outputs, columns)
-@group(0) @binding(4) var<storage, read> d_biases: array<f32>;           // (outputs,)
-@group(0) @binding(5) var<storage, read_write> d_weights: array<f32>;    // added to
-@group(0) @binding(6) var<storage, read_write> d_series: array<f32>;     // (width,)
-
+@group(0) @binding(1) var<storage, read> d_heads: array<f32>;            // (outputs, columns)
+@group(0) @binding(2) var<storage, read> d_biases: array<f32>;           // (outputs,)
+@group(0) @binding(3) var<storage, read_write> d_weights: array<f32>;    // added to
 const LANES = 64u;
+#ifdef MOTION
+@group(0) @binding(4) var<storage, read> weights: array<f32>;
+@group(0) @binding(5) var<storage, read> series: array<f32>;
+@group(0) @binding(6) var<storage, read_write> d_series: array<f32>;     // (width,)
 var<workgroup> of_lane: array<f32, LANES * MOVED>;
+#endif
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
     let w = group.x;
+    if (lane < spectrum.outputs) {
+        let factor = head_factor(spectrum, lane);
+        d_weights[spectrum.heads + lane * spectrum.width + w] += factor * d_heads[lane * spectrum.columns + w];
+        if (w == 0u) {
+            d_weights[spectrum.head_biases + lane] += factor * d_biases[lane];
+        }
+    }
+#ifdef MOTION
     let size = spectrum.width;
     let channel = series[w];
     var head: array<f32, MOVED>;
@@ -60,4 +69,5 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index
 #end
         d_series[w] = sum;
     }
+#endif
 }

@@ -1,7 +1,7 @@
 // From the layers' outputs to what the heads read.
 #import common/gate_layers
 
-@group(0) @binding(1) var<storage, read> layers: array<f32>;            // (N, LAYERS, width)
+@group(0) @binding(1) var<storage, read> layers: array<f32>;            // (N, LAYERS, width), without biases
 @group(0) @binding(2) var<storage, read_write> features: array<f32>;    // (N, FEATURES, width)
 
 @compute @workgroup_size(64)
@@ -17,8 +17,9 @@ fn main(
     let channel = number % gate.width;
     let layer = number / gate.width * LAYERS * gate.width + channel;
     let feature = number / gate.width * FEATURES * gate.width + channel;
-    features[feature] = gated(layers[layer + (LAYERS - 1u) * gate.width], layers[layer]);
+    let temporal = layers[layer + (LAYERS - 1u) * gate.width] + bias(LAYERS - 1u, channel);
+    features[feature] = gated(temporal, 0.5 * (layers[layer] + bias(0u, channel)));
 #ifdef MOTION
-    features[feature + gate.width] = max(layers[layer + gate.width], 0.0);
+    features[feature + gate.width] = max(layers[layer + gate.width] + bias(1u, channel), 0.0);
 #endif
 }

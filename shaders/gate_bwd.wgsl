@@ -18,11 +18,13 @@ fn main(
     let layer = number / gate.width * LAYERS * gate.width + channel;
     let feature = number / gate.width * FEATURES * gate.width + channel;
     let temporal = layer + (LAYERS - 1u) * gate.width;
-    let open = opening(layers[layer]);
+    let open = opening(0.5 * (layers[layer] + bias(0u, channel)));
+    let passed = layers[temporal] + bias(LAYERS - 1u, channel);
     let d_gated = d_features[feature];
-    layers[layer] = d_gated * max(layers[temporal], 0.0) * (1.0 - open * open);
-    layers[temporal] = select(0.0, d_gated * open, layers[temporal] > 0.0);
+    layers[layer] = 0.5 * d_gated * max(passed, 0.0) * (1.0 - open * open);
+    layers[temporal] = select(0.0, d_gated * open, passed > 0.0);
 #ifdef MOTION
-    layers[layer + gate.width] = select(0.0, d_features[feature + gate.width], layers[layer + gate.width] > 0.0);
+    let inner = layers[layer + gate.width] + bias(1u, channel);
+    layers[layer + gate.width] = select(0.0, d_features[feature + gate.width], inner > 0.0);
 #endif
 }

@@ -2,8 +2,11 @@
 #import common/index
 
 struct Sum {
-    count: u32,   // elements of the product
+    count: u32,     // elements of the product
     parts: u32,
+    columns: u32,   // of the product
+    stride: u32,    // from one of its rows to the next
+    first: u32,     // elements before it
 }
 
 @group(0) @binding(0) var<uniform> sum: Sum;
@@ -20,13 +23,14 @@ fn main(
     if (i >= sum.count) {
         return;
     }
+    let at = sum.first + i / sum.columns * sum.stride + i % sum.columns;
 #ifdef ADD
-    var value = total[i];
+    var value = total[at];
 #else
     var value = 0.0;
 #endif
     for (var part = 0u; part < sum.parts; part++) {
         value += parts[part * sum.count + i];
     }
-    total[i] = value;
+    total[at] = value;
 }

@@ -2,16 +2,17 @@
 #import common/index
 #import common/sort
 
-// [digit][owner]: exclusive prefix sums, or, for few owners (UNSUMMED), counts that each lane adds up for itself
+// counters [digit][owner]: exclusive prefix sums, or, for few owners (UNSUMMED), counts that each lane, or each workgroup,
+// adds up for itself
+@group(0) @binding(4) var<storage, read_write> keys_out: array<u32>;
+@group(0) @binding(5) var<storage, read_write> payload_out: array<u32>;
+
+#ifdef LANE_RUNS
 #ifdef UNSUMMED
 #table 3 counters: vec4<u32>
 #else
 #table 3 counters: u32
 #endif
-@group(0) @binding(4) var<storage, read_write> keys_out: array<u32>;
-@group(0) @binding(5) var<storage, read_write> payload_out: array<u32>;
-
-#ifdef LANE_RUNS
 #ifndef IOTA
 #table 6 payload: vec4<u32>
 #endif
@@ -56,6 +57,7 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
     }
 }
 #else
+#table 3 counters: u32
 #ifndef IOTA
 #table 6 payload: u32
 #endif
@@ -65,6 +67,9 @@ const SEGMENT_LANES = LANES / SEGMENTS;
 
 var<workgroup> ranks: array<u32, DIGITS * LANES>;
 var<workgroup> segment_sums: array<u32, LANES>;
+#ifdef UNSUMMED
+var<workgroup> of_owners: array<vec2<u32>, LANES>;   // what a lane has counted in the owners before this one, and in all
+#endif
 
 @compute @workgroup_size(128)
 fn main(
@@ -93,11 +98,27 @@ fn main(
         sum += count;
     }
     segment_sums[lane] = sum;
+#ifdef UNSUMMED
+    var counted = vec2(0u);
+    for (var owner = my_segment; owner < sort.owners; owner += SEGMENTS) {
+        counted += counters_at(my_digit * sort.owners + owner) * vec2(u32(owner < block), 1u);
+    }
+    of_owners[lane] = counted;
+#endif
     workgroupBarrier();
     var before = 0u;
+#ifdef UNSUMMED
+    for (var k = 0u; k < my_digit * SEGMENTS; k++) {
+        before += of_owners[k].y;
+    }
+    for (var k = my_digit * SEGMENTS; k < (my_digit + 1u) * SEGMENTS; k++) {
+        before += of_owners[k].x;
+    }
+#else
     if (block < sort.owners) {
         before = counters_at(my_digit * sort.owners + block);
     }
+#endif
     for (var k = my_digit * SEGMENTS; k < lane; k++) {
         before += segment_sums[k];
     }

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.kernels
 
 def gate_reference(layers: Tensor, *, motion: bool) -> Tensor:
     """(N, layers, width) -> (N, features, width)."""
-    features = gated(layers[:, -1], 2 * layers[:, 0])
+    features = gated(layers[:, -1], layers[:, 0])
     return torch.stack([features, torch.relu(layers[:, 1])], dim=1) if motion else features[:, None]
 
 
@@ -31,17 +31,19 @@ def test_gate(device: Device, count: int, width: int, *, motion: bool) -> None:
     layers[0, 0, 0], layers[-1, 0, -1] = 200.0, -200.0  # a quotient of exponentials would overflow
     options = {"MOTION": 1} if motion else {}
     forth, back = Kernel.get(device, "gate", **options), Kernel.get(device, "gate_bwd", **options)
-    uniform = DeviceArray.upload(device, "gate", np.array([count, width], np.uint32))
+    uniform = DeviceArray.upload(device, "gate", np.array([count, width, 1], np.uint32))
+    biases = 0.3 * random(*layers.shape[1:], seed=2)
+    weights = on_device(device, torch.cat([torch.full((1,), torch.nan), biases.flatten()]))
     exact = layers.double().requires_grad_()
-    expected = gate_reference(exact, motion=motion)
+    expected = gate_reference(exact + biases.double(), motion=motion)
     d_features = random(*expected.shape, seed=1)
     (d_expected,) = torch.autograd.grad(expected, exact, d_features.double())
     of_layers, features = on_device(device, layers), on_device(device, torch.full(expected.shape, torch.nan))
     with Commands(device) as commands:
         groups = -(-count * width // 64)
-        commands.dispatch(forth, groups, gate=uniform, layers=of_layers, features=features)
+        commands.dispatch(forth, groups, gate=uniform, weights=weights, layers=of_layers, features=features)
         d = on_device(device, d_features)
-        commands.dispatch(back, groups, gate=uniform, d_features=d, layers=of_layers)
+        commands.dispatch(back, groups, gate=uniform, weights=weights, d_features=d, layers=of_layers)
     torch.testing.assert_close(read(features).double(), expected.detach(), rtol=1e-5, atol=1e-6)
     # 1 - tanh^2 loses what little is left of a gate that is wide open.
     torch.testing.assert_close(read(of_layers).double(), d_expected, rtol=1e-5, atol=5e-6)

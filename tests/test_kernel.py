@@ -150,7 +150,7 @@ fn main() {
     packed = kernel.uniform("Mixed", a=0, b=(1, 2), c=(3, 4, 5), d=6, e=(7, 8, 9), f=range(10, 26), g=(26, 27), h=-28)
     out = DeviceArray.empty(device, "out", (29,))
     with Commands(device) as commands:
-        commands.dispatch(kernel, 1, mixed=BufferPool(device).constant("mixed", packed), out=out)
+        commands.dispatch(kernel, 1, mixed=BufferPool(device).constant(packed), out=out)
     assert out.read().tolist() == [*range(28), -28]
 
 
@@ -391,10 +391,15 @@ def test_a_pool_grows_and_keeps(device: Device) -> None:
     assert pool.nbytes == 1008
 
 
-def test_a_constant_is_written_when_it_changes(device: Device) -> None:
+def test_what_varies_is_written_when_it_changes(device: Device) -> None:
     pool = BufferPool(device)
-    assert pool.constant("n", struct.pack("<I", 7)).read().view(np.uint32)[0] == 7
-    version = pool.constant("n", struct.pack("<I", 7)).buffer.version
-    assert pool.constant("n", struct.pack("<I", 7)).buffer.version == version
-    assert pool.constant("n", struct.pack("<I", 8)).read().view(np.uint32)[0] == 8
-    assert pool.constant("n", struct.pack("<4I", 8, 2, 3, 4)).read().view(np.uint32).tolist() == [8, 2, 3, 4]
+
+    def varying(content: bytes) -> DeviceArray:
+        return pool.varying("n", lambda: content)
+
+    assert varying(struct.pack("<I", 7)).read().view(np.uint32)[0] == 7
+    version = varying(struct.pack("<I", 7)).buffer.version
+    assert varying(struct.pack("<I", 7)).buffer.version == version
+    assert varying(struct.pack("<I", 8)).read().view(np.uint32)[0] == 8
+    assert varying(struct.pack("<4I", 8, 2, 3, 4)).read().view(np.uint32).tolist() == [8, 2, 3, 4]
+    assert pool.constant(b"12345678") is pool.constant(b"12345678")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lapgs_wgpu.gpu import radix_sort
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
@@ -76,6 +77,12 @@ def check(
 @pytest.mark.parametrize("size", SIZES)
 def test_random_keys(device: Device, lane_runs: bool, given_payload: bool, size: int) -> None:
     check(device, random_keys(size), lane_runs=lane_runs, given_payload=given_payload)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_many_blocks_take_a_scan(device: Device, size: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(radix_sort, "FEW_BLOCKS", 1)
+    check(device, random_keys(size), lane_runs=False)
 
 
 @both_shapes

@@ -119,7 +119,7 @@ def test_the_dynamics_loss(device: Device, count: int, columns: int) -> None:
             commands.run(kernel, 64, arrays)
     totals = on_device(device, torch.zeros(3))
     with Commands(device) as commands:
-        sum_columns(commands, pool, "loss", arrays["losses"], totals, place=1, factor=2.0)
+        sum_columns(commands, pool, arrays["losses"], totals, place=1, factor=2.0)
     torch.testing.assert_close(
         read(totals).double(), torch.tensor([0.0, 2 * loss.item(), 0.0]).double(), rtol=1e-5, atol=1e-7
     )
@@ -171,7 +171,7 @@ def test_values_that_are_not_finite_are_found(device: Device, value: float, plac
     values[place] = value
     bad = word(device, 2)
     with Commands(device) as commands:
-        check_finite(commands, BufferPool(device), "values", on_device(device, values), bad)
+        check_finite(commands, BufferPool(device), on_device(device, values), bad)
     assert bad.read()[0] == (2 if abs(value) < 1e19 else 3)
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,7 @@ from helpers.scenes import relative
 from helpers.training import configure
 from torch import Tensor
 
-from lapgs_wgpu.data import Dataset
+from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.data.views import View
 from lapgs_wgpu.errors import DeviceLostError, DeviceMemoryError, InputError
 from lapgs_wgpu.gpu.device import Device
@@ -29,8 +31,8 @@ from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.exchange_step import Sample
-from lapgs_wgpu.train.resident_step import Pending
-from lapgs_wgpu.train.resident_task import ResidentSample, Task
+from lapgs_wgpu.train.resident_step import Flying
+from lapgs_wgpu.train.resident_task import Task
 from lapgs_wgpu.train.run_folder import load_state
 from lapgs_wgpu.train.step_result import Scheduled, StepResult
 from lapgs_wgpu.train.trainer import Trainer
@@ -62,8 +64,10 @@ def disturb(trainer: Trainer) -> None:
             if name == "log_scales":
                 tensor[:5] = -20.0  # below the floor
         if scene.field is not None:
-            for _, tensor in sorted(scene.field.named_parameters()):
-                tensor += 0.2 * torch.randn(tensor.shape, generator=generator)
+            for name, tensor in sorted(scene.field.named_parameters()):
+                # grid4d must move so unevenly that the acceleration's direction is not that of a rounding error.
+                size = 2.0 if name.endswith(".table") and scene.field.config.kind == "grid4d" else 0.2
+                tensor += size * torch.randn(tensor.shape, generator=generator)
             scene.field.heads.weight *= 0.3
     scene.sh_degree = 2
     if trainer.cameras is not None:
@@ -74,12 +78,12 @@ def disturb(trainer: Trainer) -> None:
 def by_resident(trainer: Trainer, task: Task) -> dict[str, Tensor]:
     step = trainer._resident
     step._push()
-    step._told(step._submit(task, Pending(step.settle), judged=True))
+    step._told(step._submit(Flying(task, step.settle), judged=True))
     gradients = {**step.parameters.gradients(), **step._passes.corrections.gradients()}
     return {name: tensors[0] for name, tensors in gradients.items()}
 
 
-def by_torch(trainer: Trainer, sample: ResidentSample, *, moving: bool) -> dict[str, Tensor]:
+def by_torch(trainer: Trainer, sample: Task, *, moving: bool) -> dict[str, Tensor]:
     nearby = times = None
     smooth = trainer.config.smoothness
     if sample.near is not None:
@@ -109,12 +113,12 @@ def test_gradients_are_those_of_torch(device: Device, dataset: Dataset, kind: st
         disturb(trainer)
     resident = trainers[0]._resident
     task = resident._task(Scheduled(4, moving, 1.0, seen=True), 2)
-    sample = task.sample
-    assert (sample.near is not None) == (sample.even is not None) == moving
-    mine, expected = by_resident(trainers[0], task), by_torch(trainers[1], sample, moving=moving)
+    assert (task.near is not None) == (task.even is not None) == moving
+    mine, expected = by_resident(trainers[0], task), by_torch(trainers[1], task, moving=moving)
     assert mine.keys() == expected.keys()
     # SwiftShader's exp is off by more, which the losses' signs of small differences make larger.
-    bound = 1e-3 if "SwiftShader" in device.info.name else 3e-5
+    bounds = {"SwiftShader": 2e-3, "llvmpipe": 1e-5}
+    bound = next((bound for name, bound in bounds.items() if name in device.info.name), 3e-5)
     for name, exact in expected.items():
         if exact.abs().max() == 0:
             assert mine[name].abs().max() == 0, name
@@ -200,28 +204,41 @@ def edits(trainer: Trainer, result: StepResult) -> None:
         trainer.scene.field.heads.weight *= 0.9
 
 
-@pytest.mark.parametrize("how", ["Ctrl-C", "lost", "memory"])
+@pytest.mark.parametrize("how", ["Ctrl-C", "lost", "memory", pytest.param("killed", marks=pytest.mark.nightly)])
 def test_a_run_that_ends_with_steps_in_flight_goes_on_to_the_same_bytes(
-    device: Device, configuration: str, dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
+    device: Device, configuration: str, data: Path, tmp_path: Path, how: str
 ) -> None:
-    """After Ctrl-C from the last step; after the loss of the device, as after a kill, from the last saved state; where
-    memory gives out because intersections outgrow it, from the last step that was waited for."""
+    """After Ctrl-C from the last step; after the loss of the device or SIGKILL from the last saved state; where memory
+    gives out because intersections outgrow it, from the last step that was waited for."""
+    dataset, out = load_dataset(data), tmp_path / "run"
     config = dataclasses.replace(configure(schedule__steps="16", schedule__save_interval="6"), step_place="resident")
     train(config, dataset, tmp_path / "whole", device=device)
-    out, broken = tmp_path / "run", open_test_device(configuration)
-    with monkeypatch.context() as patched:
-        ends = {
+    if how == "killed":  # another process, whose driver dies with it
+        call = f"import test_resident_step as t; t.ends(t.Path({str(data)!r}), t.Path({str(out)!r}), {configuration!r})"
+        ended = subprocess.run([sys.executable, "-c", call], cwd=Path(__file__).parent, check=False)
+        assert ended.returncode == -signal.SIGKILL
+    else:
+        with pytest.raises((KeyboardInterrupt, DeviceLostError, DeviceMemoryError)) as raised:
+            ends(data, out, configuration, how)
+        assert how != "lost" or f"--resume {out} goes on from the state that was saved last" in str(raised.value)
+    assert load_state(out)["training.done"] == {"Ctrl-C": 11, "lost": 6, "memory": 11, "killed": 6}[how]
+    resume(config, dataset, out, device=device)
+    assert (out / "checkpoint.ply").read_bytes() == (tmp_path / "whole" / "checkpoint.ply").read_bytes()
+
+
+def ends(data: Path, out: Path, configuration: str, how: str = "killed") -> None:
+    """A training that ends after step 11, with steps in flight."""
+    config = dataclasses.replace(configure(schedule__steps="16", schedule__save_interval="6"), step_place="resident")
+    broken = open_test_device(configuration)
+    with pytest.MonkeyPatch.context() as patched:
+        what = {
             "Ctrl-C": lambda: signal.raise_signal(signal.SIGINT),
             "lost": broken.wgpu_device.destroy,
             "memory": lambda: no_memory(rasterizer_of(broken), patched),
+            "killed": lambda: signal.raise_signal(signal.SIGKILL),
         }
-        after_step(11, ends[how], patched)
-        with pytest.raises((KeyboardInterrupt, DeviceLostError, DeviceMemoryError)) as raised:
-            train(config, dataset, out, device=broken)
-    assert how != "lost" or f"--resume {out} goes on from the state that was saved last" in str(raised.value)
-    assert load_state(out)["training.done"] == {"Ctrl-C": 11, "lost": 6, "memory": 11}[how]
-    resume(config, dataset, out, device=device)
-    assert (out / "checkpoint.ply").read_bytes() == (tmp_path / "whole" / "checkpoint.ply").read_bytes()
+        after_step(11, what[how], patched)
+        train(config, load_dataset(data), out, device=broken)
 
 
 def test_what_was_recorded_is_right_when_gaussians_go_and_sizes_change(

@@ -115,7 +115,7 @@ def test_a_lost_device_is_named_wherever_it_is_used(doomed: Device) -> None:
 
     def texture() -> None:
         with Commands(doomed) as commands:
-            small.buffer.texture(commands._encoder, "r32float", 0, 64)
+            commands._texture(small, "r32float")
 
     uses: list[Callable[[], Any]] = [
         dispatch,

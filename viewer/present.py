@@ -76,7 +76,7 @@ class Presenter:
             "low": image.low,
             "high": image.high,
         }
-        uniform = self._pool.constant("present", pack(self._source, "Present", values))
+        uniform = self._pool.varying("present", lambda: pack(self._source, "Present", values))
         entries = [{"binding": i, "resource": array.resource} for i, array in enumerate((uniform, image.planes))]
         native = self.device.wgpu_device
         encoder = native.create_command_encoder()

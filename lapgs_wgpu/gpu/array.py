@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.gpu.native import READ, mapping
+from lapgs_wgpu.gpu.native import READ, Mapping
 from lapgs_wgpu.gpu.wgpu_errors import TranslatedErrors
 
 _ITEM_BYTES = {"float32": 4, "uint32": 4, "uint8": 1, "uint64": 8}
@@ -107,7 +107,7 @@ def read_all(arrays: Sequence[DeviceArray]) -> list[NDArray[Any]]:
         device = array.buffer.device
         with (
             TranslatedErrors(device, f"what is read from buffer {array.buffer.label!r}", nbytes),
-            mapping(device, source, READ, offset, size) as content,
+            Mapping(device, source, READ, offset, size) as content,
         ):
             out.append(content[:nbytes].copy().view(array.dtype).reshape(array.shape))
     return out

@@ -12,9 +12,8 @@ import wgpu
 from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import DeviceMemoryError
-from lapgs_wgpu.gpu.bind_group import BindGroup
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.gpu.native import WRITE, Encoder, TextureCopies, mapping
+from lapgs_wgpu.gpu.native import WRITE, Mapping, TextureCopies
 from lapgs_wgpu.gpu.shader import TABLE_TYPES, TABLE_WIDTH
 from lapgs_wgpu.gpu.wgpu_errors import TranslatedErrors
 
@@ -23,6 +22,24 @@ _SMALL = 1 << 16  # bytes that go through the queue where buffers are not mapped
 _MAPPABLE = wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.MAP_WRITE
 _MOST_ROWS = 8192  # of a texture, by WebGPU's default limits
 _numbers = itertools.count()
+
+
+@dataclass(eq=False)
+class BindGroup:
+    """A wgpu bind group, and its entry in the kernel's cache.
+
+    native: the library's; wgpu keeps it alive. textures: kept alive, since their ids are part of the key.
+    """
+
+    native: Any
+    wgpu: Any
+    textures: dict[str, Any]
+    store: dict[Any, BindGroup]
+    key: Any
+
+    def drop(self) -> None:
+        """Remove it from the cache, since one of its buffers was freed."""
+        self.store.pop(self.key, None)
 
 
 def _forget(bound: weakref.WeakSet[BindGroup], device: Device, nbytes: int) -> None:
@@ -119,13 +136,13 @@ class Buffer:
                 self._uploaded = True
 
     def _fill(self, target: Any, data: NDArray[np.uint8], offset: int) -> None:
-        with mapping(self.device, target, WRITE, offset, (data.nbytes + 7) & ~7) as content:
+        with Mapping(self.device, target, WRITE, offset, (data.nbytes + 7) & ~7) as content:
             content[: data.nbytes] = data
 
-    def texture(self, encoder: Encoder, texel_format: str, offset: int, size: int) -> Any:
+    def texture(self, texel_format: str, offset: int, size: int) -> tuple[Any, TextureCopies | None]:
         """Return a view of a texture that holds `size` bytes from `offset` on, in rows of TABLE_WIDTH texels.
 
-        If the buffer has changed, a copy is recorded in `encoder`.
+        If the buffer has changed, also the copies that have to be made first.
         """
         texel = next(nbytes for name, nbytes, _ in TABLE_TYPES.values() if name == texel_format)
         count = size // texel
@@ -145,7 +162,7 @@ class Buffer:
             held.place = (offset, size)
             held.copies = TextureCopies(self.wgpu_buffer, offset, held.texture, TABLE_WIDTH, texel, count)
             held.version = -1
-        if held.version != self.version:
-            held.version = self.version
-            encoder.copy_to_texture(held.copies)
-        return held.view
+        if held.version == self.version:
+            return held.view, None
+        held.version = self.version
+        return held.view, held.copies

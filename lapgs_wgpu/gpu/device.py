@@ -11,7 +11,6 @@ from typing import Any
 
 from lapgs_wgpu.errors import NoAdapterError
 from lapgs_wgpu.gpu.cffi_patch import parse_named_types_only
-from lapgs_wgpu.gpu.recording import Recording
 
 # Optional features; each has a fallback.
 _WANTED_FEATURES = ("subgroup", "mappable-primary-buffers", "timestamp-query")
@@ -149,7 +148,7 @@ class Device:
         command buffer (gfx-rs/wgpu#9531), so there the host polls.
     watchdog: whether the driver ends a submission that takes seconds, as on Windows and macOS (all but CPU devices).
     mappable: whether buffers can be mapped without a staging copy (CPU devices).
-    recording: what is done now is taken down in it.
+    recording: the Recording in which is taken down what is done now; None where it is not.
     generation: number of buffers that pools have made: what was recorded before the last one may use a freed one.
     allocated_bytes: of all buffers at present, without staging buffers and textures.
     max_loop_turns: number of iterations, of all loops of an invocation together, after which the driver ends it; None
@@ -191,7 +190,7 @@ class Device:
         self.kernel_cache: dict[Any, Any] = {}
         self.allocated_bytes = 0
         self.generation = 0
-        self.recording: Recording | None = None
+        self.recording: Any = None
 
     @property
     def max_binding(self) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from types import TracebackType
 from typing import Any
@@ -11,12 +11,10 @@ from typing import Any
 import wgpu
 
 from lapgs_wgpu.errors import DeviceMemoryError
+from lapgs_wgpu.gpu import native
 from lapgs_wgpu.gpu.array import DeviceArray
-from lapgs_wgpu.gpu.bind_group import BindGroup
-from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.buffer import BindGroup, Buffer
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.gpu.native import Encoder, raising
-from lapgs_wgpu.gpu.profile import Profile
 from lapgs_wgpu.gpu.recording import Recording
 from lapgs_wgpu.gpu.shader import Binding, Defines, ShaderError, compose, enabled, pack, reflect
 from lapgs_wgpu.gpu.wgpu_errors import TranslatedErrors, is_lost
@@ -36,11 +34,11 @@ class Kernel:
         limit = device.limits["max-storage-buffers-per-shader-stage"]
         if len(storage) > limit:
             raise ShaderError(f"shaders/{name}.wgsl binds {len(storage)} storage buffers; the device allows {limit}")
-        native = device.wgpu_device
+        wgpu_device = device.wgpu_device
         try:
-            module = native.create_shader_module(label=name, code=self.source)
+            module = wgpu_device.create_shader_module(label=name, code=self.source)
         except wgpu.GPUError as error:
-            if is_lost(native):
+            if is_lost(wgpu_device):
                 with TranslatedErrors(device, "a shader"):
                     raise
             raise ShaderError(f"shaders/{name}.wgsl does not compile:\n{error}") from error
@@ -53,12 +51,13 @@ class Kernel:
             )
             for b in self.bindings.values()
         ]
-        self._layout = native.create_bind_group_layout(entries=entries)
-        self.pipeline = native.create_compute_pipeline(
+        self._layout = wgpu_device.create_bind_group_layout(entries=entries)
+        self.pipeline = wgpu_device.create_compute_pipeline(
             label=name,
-            layout=native.create_pipeline_layout(bind_group_layouts=[self._layout]),
+            layout=wgpu_device.create_pipeline_layout(bind_group_layouts=[self._layout]),
             compute={"module": module, "entry_point": "main"},
         )
+        self.native = self.pipeline._internal
         self._groups: dict[Any, BindGroup] = {}
         self.textures = {name: binding.type for name, binding in self.bindings.items() if binding.kind == "texture"}
         self.written = [name for name, binding in self.bindings.items() if binding.kind == "read_write"]
@@ -100,8 +99,8 @@ class Kernel:
                     f"but {self.device.info.name} allows {self.device.max_binding}"
                 )
 
-    def bind(self, arrays: dict[str, DeviceArray], textures: dict[str, Any]) -> Any:
-        """Return wgpu's bind group for arrays; `textures` replace some of them. Raises as `check` does."""
+    def bind(self, arrays: dict[str, DeviceArray], textures: dict[str, Any]) -> BindGroup:
+        """Return the bind group for arrays; `textures` replace some of them. Raises as `check` does."""
         key = tuple((name, array.key, id(textures.get(name))) for name, array in arrays.items())
         group = self._groups.get(key)
         if group is None:
@@ -112,11 +111,11 @@ class Kernel:
                 entries.append({"binding": self.bindings[name].number, "resource": resource})
             if len(self._groups) > 64:  # groups of earlier array sizes accumulate
                 self._groups.clear()
-            native = self.device.wgpu_device.create_bind_group(layout=self._layout, entries=entries)
-            group = self._groups[key] = BindGroup(native, textures, self._groups, key)
+            made = self.device.wgpu_device.create_bind_group(layout=self._layout, entries=entries)
+            group = self._groups[key] = BindGroup(made._internal, made, textures, self._groups, key)
             for array in arrays.values():
                 array.buffer.bound.add(group)
-        return group.native
+        return group
 
 
 def _scalar(binding: Binding) -> str | None:
@@ -130,24 +129,14 @@ def _scalar(binding: Binding) -> str | None:
 
 
 class Commands:
-    """A list of dispatches, submitted when the `with` block ends without an error.
+    """A list of dispatches, clears and copies, submitted when the `with` block ends without an error.
 
-    profile: measures the time of each dispatch, which then gets a compute pass of its own. whole: submit all at once,
-    whatever `flush` asks for.
+    whole: submit all at once, whatever `flush` asks for.
     """
 
-    def __init__(
-        self,
-        device: Device,
-        profile: Profile | None = None,
-        *,
-        whole: bool = False,
-    ) -> None:
-        self.device = device
-        self._whole = whole
-        self._profile = profile
-        self._encoder = Encoder(device.wgpu_device)
-        self._raising = raising("commands")
+    def __init__(self, device: Device, *, whole: bool = False) -> None:
+        self.device, self._whole = device, whole
+        self._list: list[native.Command] = []
         self._copied: list[Buffer] = []
 
     def dispatch(self, kernel: Kernel, groups: int, **arrays: DeviceArray) -> None:
@@ -169,101 +158,70 @@ class Commands:
         ):
             kernel.check(arrays)
         textures = {name: self._texture(arrays[name], texels) for name, texels in kernel.textures.items()}
-        group = kernel.bind(arrays, textures)
-        self._encoder.begin_pass(None if self._profile is None else self._profile.record(kernel.name))
-        self._encoder.dispatch(kernel.pipeline, group, *groups)
-        self._record("dispatch", (kernel.pipeline, group), *groups)
+        self._list.append(("dispatch", kernel, kernel.bind(arrays, textures), *groups))
         for name in kernel.written:
             arrays[name].buffer.version += 1
 
     def _texture(self, array: DeviceArray, texel_format: str) -> Any:
-        self._copied.append(array.buffer)
-        return array.buffer.texture(self._encoder, texel_format, array.offset, array.bound_bytes)
+        view, copies = array.buffer.texture(texel_format, array.offset, array.bound_bytes)
+        if copies is not None:
+            self._copied.append(array.buffer)
+            self._list.append(("texture", copies))
+        return view
 
     def clear(self, array: DeviceArray) -> None:
         """Set an array, rounded up to 4 bytes, to zero."""
-        if array.nbytes == 0:
-            return
-        array.buffer.version += 1
-        place = array.offset, (array.nbytes + 3) & ~3
-        self._encoder.clear(array.buffer.wgpu_buffer, *place)
-        self._record("clear", (array.buffer.wgpu_buffer,), *place)
+        if array.nbytes:
+            array.buffer.version += 1
+            self._list.append(("clear", array.buffer.wgpu_buffer, array.offset, (array.nbytes + 3) & ~3))
 
     def copy(self, source: DeviceArray, target: DeviceArray) -> None:
         """Copy an array to another of the same size in bytes."""
         if source.nbytes != target.nbytes:
             raise ValueError(f"{target.buffer.label}: {source.nbytes} bytes are copied to {target.nbytes}")
         target.buffer.version += 1
-        self._encoder.copy(
-            source.buffer.wgpu_buffer, source.offset, target.buffer.wgpu_buffer, target.offset, source.nbytes
-        )
-        if self.device.recording is not None:
-            raise ValueError("copies are not recorded")
+        self.copy_out(source, target.buffer.wgpu_buffer, target.offset)
 
     def copy_out(self, source: DeviceArray, target: Any, offset: int) -> None:
         """Copy an array to a wgpu buffer, `offset` bytes from its start."""
-        self._encoder.copy(source.buffer.wgpu_buffer, source.offset, target, offset, source.nbytes)
-
-    def varying(self, write: Callable[[], DeviceArray]) -> DeviceArray:
-        """A uniform whose content differs from one replay to the next: `write` writes it, and is called before each."""
-        recording = self.device.recording
-        varied: DeviceArray = write() if recording is None else recording.vary(write)
-        return varied
+        self._list.append(("copy", source.buffer.wgpu_buffer, source.offset, target, offset, source.nbytes))
 
     @contextmanager
-    def taken_down(self, recording: Recording | None) -> Iterator[None]:
+    def taken_down(self, recording: Recording) -> Iterator[None]:
         """Take down in a recording what is done within, for `replay`."""
-        self.device.recording = recording
+        first, self.device.recording = len(self._list), recording
         try:
             yield
         finally:
             self.device.recording = None
-
-    def _record(self, kind: str, objects: tuple[Any, ...], *numbers: int) -> None:
-        if (recording := self.device.recording) is not None:
-            recording.kept.append(objects)
-            recording.commands.append((kind, *(each._internal for each in objects), *numbers))
+        recording.finish(self._list[first:])
 
     def replay(self, recording: Recording) -> None:
-        """Do what was recorded, after its uniforms were written."""
-        for (pool, name), content in recording.constants.items():
-            pool.refresh(name, content)
-        for write in recording.writers:
-            write()
-        self._encoder.replay(recording.commands)
+        """Do what was recorded, with uniforms that are written anew."""
+        recording.renew()
+        self._list += recording.commands
 
     def flush(self) -> None:
         """Submit what was recorded so far, where a watchdog ends long submissions, and go on. It runs even where the
         `with` block fails later."""
-        if self._whole or not self.device.watchdog:
-            return
-        with TranslatedErrors(self.device, "commands"):
+        if self.device.watchdog and not self._whole:
             self._submit()
-        self._encoder = Encoder(self.device.wgpu_device)
-        self._raising = raising("commands")
-        self._raising.__enter__()
-        self._copied.clear()
 
     def _submit(self) -> None:
-        self._encoder.end_pass()
-        self._raising.__exit__(None, None, None)
-        self._encoder.submit(self.device.queue)
+        with TranslatedErrors(self.device, "commands"):
+            encoder = self.device.wgpu_device.create_command_encoder()
+            with native.raising("commands"):
+                native.play(encoder, self._list)
+            self.device.queue.submit([encoder.finish()])
+        self._list, self._copied = [], []
 
     def __enter__(self) -> Commands:
-        self._raising.__enter__()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        translated = TranslatedErrors(self.device, "commands")
-        if kind is not None:
-            for buffer in self._copied:  # the copies are never made
-                buffer.version += 1
-            self._encoder.end_pass()
-            self._raising.__exit__(kind, error, at)
-            translated.__exit__(kind, error, at)
-            return
-        with translated:
-            self._encoder.end_pass()
-            if self._profile is not None:
-                self._profile.resolve(self._encoder.wgpu_encoder)
+        if kind is None:
             self._submit()
+            return
+        for buffer in self._copied:  # the copies are never made
+            buffer.version += 1
+        TranslatedErrors(self.device, "commands").__exit__(kind, error, at)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,41 +12,35 @@ from lapgs_wgpu.errors import DeviceLostError
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
-from lapgs_wgpu.gpu.native import LONGEST_WAIT, Mapping
+from lapgs_wgpu.gpu.native import READ, Mapping
 from lapgs_wgpu.gpu.wgpu_errors import TranslatedErrors, is_lost
-
-_PAUSE = 50e-6  # seconds between two looks
 
 
 class Later:
-    """Copies of some arrays, which `record` makes, and which `read` waits for once they were submitted."""
+    """Copies of some arrays, which `Ring.record` makes, and which `read` waits for once they were submitted."""
 
     def __init__(self, ring: Ring, buffer: Any, arrays: Sequence[DeviceArray]) -> None:
         self._ring, self._buffer, self._arrays = ring, buffer, list(arrays)
-        self._mapping: Mapping | None = None
+        self._mapping: Mapping
 
     def submitted(self) -> None:
         """Ask for the copies, after the submission that makes them."""
         with TranslatedErrors(self._ring.device, "what is read later"):
-            self._mapping = Mapping(self._buffer, self._ring.nbytes)
+            self._mapping = Mapping(self._ring.device, self._buffer, READ, 0, self._ring.nbytes)
 
     def read(self) -> list[NDArray[Any]]:
         """The arrays' contents. Raises DeviceError where the device does not give them."""
-        assert self._mapping is not None
-        device, deadline = self._ring.device, time.monotonic() + LONGEST_WAIT
+        device, found, at = self._ring.device, [], 0
         with TranslatedErrors(device, "what is read later"):
-            while not self._mapping.poll(device):
-                if time.monotonic() > deadline:
-                    raise DeviceLostError(f"{device.info.name} has not answered for {LONGEST_WAIT:.0f} seconds")
-                time.sleep(_PAUSE)
+            self._mapping.wait(alone=True)
             if is_lost(device.wgpu_device):  # the native library would end the process
                 raise DeviceLostError(f"{device.info.name} was lost, because its driver gave up or it was removed")
-            content = self._mapping.take()
+            with self._mapping as content:
+                for array in self._arrays:
+                    values = content[at : at + array.nbytes].copy()
+                    found.append(values.view(array.dtype).reshape(array.shape))
+                    at += array.nbytes
         self._ring.free.append(self._buffer)
-        found, at = [], 0
-        for array in self._arrays:
-            found.append(content[at : at + array.nbytes].view(array.dtype).reshape(array.shape))
-            at += array.nbytes
         return found
 
 

@@ -44,35 +44,29 @@ class Matrix:
 
 
 class Matmul:
-    """Records matrix products. Sums have a fixed order, so results are the same to the last bit on every run.
-
-    name, in the calls: distinguishes products that are submitted together.
-    """
+    """Records matrix products. Sums have a fixed order, so results are the same to the last bit on every run."""
 
     def __init__(self, device: Device, pool: BufferPool) -> None:
         self._device, self._pool = device, pool
 
-    def __call__(self, commands: Commands, name: str, a: Matrix, b: Matrix, c: Matrix, *, add: bool = False) -> None:
+    def __call__(self, commands: Commands, a: Matrix, b: Matrix, c: Matrix, *, add: bool = False) -> None:
         """Record c = a b, or c += a b with `add`. c must not be transposed."""
-        self._dispatch(commands, name, a, b, c, a.columns, add=add)
+        self._dispatch(commands, a, b, c, a.columns, add=add)
 
-    def split_k(
-        self, commands: Commands, name: str, a: Matrix, b: Matrix, total: DeviceArray, *, add: bool = False
-    ) -> None:
-        """Record total = a b, or total += a b with `add`, for a long inner dimension.
+    def split_k(self, commands: Commands, a: Matrix, b: Matrix, c: Matrix, *, add: bool = False) -> None:
+        """Record c = a b, or c += a b with `add`, for a long inner dimension.
 
         The dimension is split, which occupies the device and keeps partial sums short, hence accurate.
         """
-        size, count = a.rows * b.columns, -(-a.columns // _SPLIT)
+        count = -(-a.columns // _SPLIT)
         parts = self._pool.array("parts", (count, a.rows, b.columns))
-        self._dispatch(commands, name, a, b, Matrix(parts, a.rows, b.columns, b.columns), _SPLIT)
+        self._dispatch(commands, a, b, Matrix(parts, a.rows, b.columns, b.columns), _SPLIT)
         kernel = Kernel.get(self._device, "matmul_sum", ADD=add)
-        uniform = self._pool.constant(f"sum {name}", kernel.uniform("Sum", count=size, parts=count))
-        commands.dispatch(kernel, -(-size // 64), sum=uniform, parts=parts, total=total)
+        place = {"columns": c.columns, "stride": c.stride, "first": c.first}
+        uniform = self._pool.constant(kernel.uniform("Sum", count=a.rows * b.columns, parts=count, **place))
+        commands.dispatch(kernel, -(-a.rows * b.columns // 64), sum=uniform, parts=parts, total=c.array)
 
-    def _dispatch(
-        self, commands: Commands, name: str, a: Matrix, b: Matrix, c: Matrix, split: int, *, add: bool = False
-    ) -> None:
+    def _dispatch(self, commands: Commands, a: Matrix, b: Matrix, c: Matrix, split: int, *, add: bool = False) -> None:
         kernel = Kernel.get(self._device, "matmul", ADD=add, A_INNER=not a.transposed, B_INNER=b.transposed)
         content = kernel.uniform(
             "Matmul",
@@ -89,7 +83,7 @@ class Matmul:
         commands.dispatch(
             kernel,
             -(-c.rows // _TILE) * -(-c.columns // _TILE) * -(-a.columns // split),
-            product=self._pool.constant(f"product {name}", content),
+            product=self._pool.constant(content),
             a=a.array,
             b=b.array,
             c=c.array,

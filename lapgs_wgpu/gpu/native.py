@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -62,144 +62,82 @@ class _Callback(threading.local):
 _callback = _Callback()
 
 
-@contextmanager
-def mapping(device: Device, buffer: Any, mode: int, offset: int, nbytes: int) -> Iterator[NDArray[np.uint8]]:
-    """The bytes of a buffer, in place, once the device has done what uses them. Threads may map at the same time.
-
-    offset: a multiple of 8. nbytes: a multiple of 4. Raises wgpu.GPUError, or RuntimeError where the device refuses.
-    """
-    number, info = next(_numbers), _callback.info
-    info.userdata1 = ffi.cast("void *", number)
-    with raising("wgpuBufferMapAsync"):
-        lib.wgpuBufferMapAsync(buffer._internal, mode, offset, nbytes, info[0])
-        _wait_for(device, number)
-    status = _statuses.pop(number)
-    if status != lib.WGPUMapAsyncStatus_Success:
-        raise RuntimeError(f"Could not map buffer ({status}).")
-    try:
-        start = lib.wgpuBufferGetMappedRange(buffer._internal, offset, nbytes)
-        yield np.frombuffer(ffi.buffer(start, nbytes), np.uint8)
-    finally:
-        lib.wgpuBufferUnmap(buffer._internal)
-
-
-def _wait_for(device: Device, number: int) -> None:
-    """Poll the device until a mapping is done. Raises DeviceLostError where it never is."""
-    native = device.wgpu_device._internal
-    if device.waits:
-        while number not in _statuses:
-            lib.wgpuDevicePoll(native, True, ffi.NULL)
-        return
-    deadline, pause = time.monotonic() + LONGEST_WAIT, _SHORTEST_SLEEP
-    while True:
-        lib.wgpuDevicePoll(native, False, ffi.NULL)
-        if number in _statuses:
-            return
-        if time.monotonic() > deadline:
-            raise DeviceLostError(
-                f"{device.info.name} has not answered for {LONGEST_WAIT:.0f} seconds: its driver has ended the work"
-            )
-        time.sleep(pause)
-        pause = min(2 * pause, _LONGEST_SLEEP)
-
-
 class Mapping:
-    """The bytes of a buffer, once the device has done what uses them, without a wait."""
+    """The bytes of a buffer, asked for now, and there once the device has done what uses them.
 
-    def __init__(self, buffer: Any, nbytes: int) -> None:
-        self._buffer, self._nbytes, self._number = buffer, nbytes, next(_numbers)
-        info = _callback.info
+    `with` waits and gives them in place, until it ends. Threads may map at the same time. offset: a multiple of 8.
+    nbytes: a multiple of 4. Raises wgpu.GPUError, or RuntimeError where the device refuses.
+    """
+
+    def __init__(self, device: Device, buffer: Any, mode: int, offset: int, nbytes: int) -> None:
+        self._device, self._buffer, self._place = device, buffer, (offset, nbytes)
+        self._number, info = next(_numbers), _callback.info
         info.userdata1 = ffi.cast("void *", self._number)
         with raising("wgpuBufferMapAsync"):
-            lib.wgpuBufferMapAsync(buffer._internal, READ, 0, nbytes, info[0])
+            lib.wgpuBufferMapAsync(buffer._internal, mode, offset, nbytes, info[0])
 
-    def poll(self, device: Device) -> bool:
-        """Whether the bytes are there."""
-        lib.wgpuDevicePoll(device.wgpu_device._internal, False, ffi.NULL)
-        return self._number in _statuses
+    def wait(self, *, alone: bool = False) -> None:
+        """Wait for the bytes, `alone`: not for what was submitted later. Raises DeviceLostError where none come."""
+        device, deadline, pause = self._device, time.monotonic() + LONGEST_WAIT, _SHORTEST_SLEEP
+        idle = device.waits and not alone  # the library then waits for all that was submitted
+        while self._number not in _statuses:
+            lib.wgpuDevicePoll(device.wgpu_device._internal, idle, ffi.NULL)
+            if idle or self._number in _statuses:
+                continue
+            if time.monotonic() > deadline:
+                raise DeviceLostError(
+                    f"{device.info.name} has not answered for {LONGEST_WAIT:.0f} seconds: its driver has ended the work"
+                )
+            time.sleep(pause)
+            pause = min(2 * pause, _LONGEST_SLEEP)
 
-    def take(self) -> NDArray[np.uint8]:
-        """A copy of the bytes, when they are there. Raises RuntimeError where the device refused them."""
+    def __enter__(self) -> NDArray[np.uint8]:
+        with raising("wgpuDevicePoll"):
+            self.wait()
         status = _statuses.pop(self._number)
         if status != lib.WGPUMapAsyncStatus_Success:
             raise RuntimeError(f"Could not map buffer ({status}).")
-        start = lib.wgpuBufferGetMappedRange(self._buffer._internal, 0, self._nbytes)
-        content = np.frombuffer(ffi.buffer(start, self._nbytes), np.uint8).copy()
+        start = lib.wgpuBufferGetMappedRange(self._buffer._internal, *self._place)
+        return np.frombuffer(ffi.buffer(start, self._place[1]), np.uint8)
+
+    def __exit__(self, *error: object) -> None:
         lib.wgpuBufferUnmap(self._buffer._internal)
-        return content
 
 
-class Encoder:
-    """Records commands for one submission, within `raising`."""
+# A command: ("dispatch", kernel, bind group, columns, rows), ("clear", buffer, offset, bytes), ("copy", source, offset,
+# target, offset, bytes) or ("texture", copies).
+Command = tuple[Any, ...]
 
-    def __init__(self, device: Any) -> None:
-        self.wgpu_encoder = device.create_command_encoder()
-        self._encoder = self.wgpu_encoder._internal
-        self._pass: Any = None
-        self._timed: Any = None  # wgpu-py's pass, where it writes timestamps
 
-    def begin_pass(self, timestamp_writes: dict[str, Any] | None = None) -> None:
-        """Begin a compute pass, unless one is open; a new one in any case where it writes timestamps."""
-        if timestamp_writes is not None:
-            self.end_pass()
-            self._timed = self.wgpu_encoder.begin_compute_pass(timestamp_writes=timestamp_writes)
-            self._pass = self._timed._internal
-        elif self._pass is None:
-            self._pass = lib.wgpuCommandEncoderBeginComputePass(self._encoder, ffi.NULL)
-
-    def end_pass(self) -> None:
-        """End the compute pass that is open, if one is."""
-        if self._pass is None:
-            return
-        lib.wgpuComputePassEncoderEnd(self._pass)
-        if self._timed is None:
-            lib.wgpuComputePassEncoderRelease(self._pass)
-        self._pass = self._timed = None
-
-    def dispatch(self, pipeline: Any, bind_group: Any, columns: int, rows: int) -> None:
-        """Run a pipeline's workgroups on what is bound, within a pass."""
-        lib.wgpuComputePassEncoderSetPipeline(self._pass, pipeline._internal)
-        lib.wgpuComputePassEncoderSetBindGroup(self._pass, 0, bind_group._internal, 0, ffi.NULL)
-        lib.wgpuComputePassEncoderDispatchWorkgroups(self._pass, columns, rows, 1)
-
-    def replay(self, commands: list[tuple[Any, ...]]) -> None:
-        """Do what a Recording holds."""
-        pipeline_of, group_of = lib.wgpuComputePassEncoderSetPipeline, lib.wgpuComputePassEncoderSetBindGroup
-        run, nothing = lib.wgpuComputePassEncoderDispatchWorkgroups, ffi.NULL
-        for kind, *values in commands:
-            if kind == "clear":
-                self.end_pass()
-                lib.wgpuCommandEncoderClearBuffer(self._encoder, *values)
-                continue
-            if self._pass is None:
-                self.begin_pass()
-            pipeline, group, columns, rows = values
-            pipeline_of(self._pass, pipeline)
-            group_of(self._pass, 0, group, 0, nothing)
-            run(self._pass, columns, rows, 1)
-
-    def clear(self, buffer: Any, offset: int, nbytes: int) -> None:
-        """Set bytes of a buffer to zero."""
-        self.end_pass()
-        lib.wgpuCommandEncoderClearBuffer(self._encoder, buffer._internal, offset, nbytes)
-
-    def copy(self, source: Any, source_offset: int, target: Any, target_offset: int, nbytes: int) -> None:
-        """Copy bytes from buffer to buffer."""
-        self.end_pass()
-        lib.wgpuCommandEncoderCopyBufferToBuffer(
-            self._encoder, source._internal, source_offset, target._internal, target_offset, nbytes
-        )
-
-    def copy_to_texture(self, copies: TextureCopies) -> None:
-        """Copy from a buffer to a texture."""
-        self.end_pass()
-        for source, target, size in copies.parts:
-            lib.wgpuCommandEncoderCopyBufferToTexture(self._encoder, source, target, size)
-
-    def submit(self, queue: Any) -> None:
-        """Have the device do what was recorded. Raises wgpu.GPUError where it refuses."""
-        self.end_pass()
-        queue.submit([self.wgpu_encoder.finish()])
+def play(encoder: Any, commands: Iterable[Command]) -> None:
+    """Record commands in wgpu's encoder, within `raising`. Dispatches with nothing between share a compute pass."""
+    native, open_pass, last = encoder._internal, None, None
+    pipeline_of, group_of = lib.wgpuComputePassEncoderSetPipeline, lib.wgpuComputePassEncoderSetBindGroup
+    dispatch, nothing = lib.wgpuComputePassEncoderDispatchWorkgroups, ffi.NULL
+    for what, *values in (*commands, ("end",)):
+        if what == "dispatch":
+            kernel, group, columns, rows = values
+            if open_pass is None:
+                open_pass, last = lib.wgpuCommandEncoderBeginComputePass(native, nothing), None
+            if kernel is not last:
+                pipeline_of(open_pass, kernel.native)
+                last = kernel
+            group_of(open_pass, 0, group.native, 0, nothing)
+            dispatch(open_pass, columns, rows, 1)
+            continue
+        if open_pass is not None:
+            lib.wgpuComputePassEncoderEnd(open_pass)
+            lib.wgpuComputePassEncoderRelease(open_pass)
+            open_pass = None
+        if what == "clear":
+            buffer, offset, nbytes = values
+            lib.wgpuCommandEncoderClearBuffer(native, buffer._internal, offset, nbytes)
+        elif what == "copy":
+            source, offset, target, to, nbytes = values
+            lib.wgpuCommandEncoderCopyBufferToBuffer(native, source._internal, offset, target._internal, to, nbytes)
+        elif what == "texture":
+            for part in values[0].parts:
+                lib.wgpuCommandEncoderCopyBufferToTexture(native, *part)
 
 
 class TextureCopies:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,8 @@ from numpy.typing import NDArray
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import Device
+
+_MOST_CONSTANTS = 1024  # of a pool: those of earlier sizes accumulate
 
 
 class BufferPool:
@@ -22,7 +25,8 @@ class BufferPool:
     def __init__(self, device: Device) -> None:
         self.device = device
         self._buffers: dict[str, Buffer] = {}
-        self._constants: dict[str, bytes] = {}
+        self._constants: dict[bytes, DeviceArray] = {}
+        self._written: dict[str, bytes] = {}
 
     def array(self, name: str, shape: tuple[int, ...], dtype: str = "float32") -> DeviceArray:
         """Return an array at the start of the named buffer, whose content is lost if it has to grow."""
@@ -39,23 +43,31 @@ class BufferPool:
         array.write(values)
         return array
 
-    def constant(self, name: str, content: bytes) -> DeviceArray:
-        """Return a small array with this content, written only when it changes.
+    def constant(self, content: bytes) -> DeviceArray:
+        """Return a small array with this content, the same one each time."""
+        if self.device.recording is not None:
+            return self.device.recording.constant(content)
+        if content not in self._constants:
+            if len(self._constants) >= _MOST_CONSTANTS:
+                self._constants.clear()
+            array = DeviceArray.upload(self.device, "constant", np.frombuffer(content, np.uint8))
+            self._constants[content] = array
+        return self._constants[content]
 
-        The content must not change between recording and submission of a command that reads it.
+    def varying(self, name: str, write: Callable[[], bytes]) -> DeviceArray:
+        """Return a small array with the content that `write` gives, which is written over in the next call.
+
+        The content must not change between recording and submission of a command that reads it; replays of a recording
+        ask for it anew.
         """
         if self.device.recording is not None:
-            self.device.recording.note(self, name, content)
-        array = self.array(f"constant {name}", (len(content),), "uint8")
-        if self._constants.get(name) != content:
+            return self.device.recording.varying((self, name), write)
+        content = write()
+        array = self.array(f"varying {name}", (len(content),), "uint8")
+        if self._written.get(name) != content:
             array.write(np.frombuffer(content, np.uint8))
-            self._constants[name] = content
+            self._written[name] = content
         return array
-
-    def refresh(self, name: str, content: bytes) -> None:
-        """Write a constant again, unless it still has this content."""
-        if self._constants.get(name) != content:
-            self.constant(name, content)
 
     @property
     def nbytes(self) -> int:

@@ -11,7 +11,8 @@ from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.gpu.scan import Scan
 
 _SORT_BLOCK_ITEMS = 2048  # common/sort.wgsl: 128 lanes x 16 elements
-FEW_OWNERS = 32  # of runs: adding up their counters in each lane takes less time than the dispatches of a scan
+# Of runs, and of blocks: adding up their counters in each lane, or workgroup, takes less time than a scan's dispatches.
+FEW_RUNS, FEW_BLOCKS = 32, 256
 
 
 def runs(capacity: int) -> int:
@@ -52,7 +53,7 @@ class RadixSort:
             owners = runs(capacity)
         else:
             owners = -(-capacity // _SORT_BLOCK_ITEMS)
-        unsummed = self._lane_runs and owners <= FEW_OWNERS
+        unsummed = owners <= (FEW_RUNS if self._lane_runs else FEW_BLOCKS)
         counters = self._pool.array(f"{self._name} counters", (digits * owners,), "uint32")
         keys_out = self._pool.array(f"{self._name} keys", (capacity,), "uint32")
         payload_out = self._pool.array(f"{self._name} payload", (capacity,), "uint32")
@@ -62,10 +63,8 @@ class RadixSort:
         groups = owners // 8 if self._lane_runs else owners
         count_kernel = Kernel.get(self._device, "sort_count", LANE_RUNS=self._lane_runs)
         for step in range(passes):
-            uniform = self._pool.constant(
-                f"{self._name} pass {step}",
-                count_kernel.uniform("Sort", shift=step * width, digits=digits, owners=owners, capacity=capacity),
-            )
+            sizes = {"shift": step * width, "digits": digits, "owners": owners, "capacity": capacity}
+            uniform = self._pool.constant(count_kernel.uniform("Sort", **sizes))
             arrays = {"sort": uniform, "length": length, "keys": keys}
             commands.dispatch(count_kernel, groups, counters=counters, **arrays)
             places = counters if unsummed else self._summed(commands, counters)
@@ -82,6 +81,6 @@ class RadixSort:
         (count,) = counters.shape
         places = self._pool.array(f"{self._name} places", (count,), "uint32")
         total = self._pool.array(f"{self._name} total", (1,), "uint32")
-        length = self._pool.constant(f"{self._name} counter count", struct.pack("<I", count))
+        length = self._pool.constant(struct.pack("<I", count))
         self._scan(commands, length=length, capacity=count, values=counters, prefix=places, total=total)
         return places

@@ -38,5 +38,6 @@ class Scan:
         count = max(1, -(-capacity // _BLOCK_ITEMS))
         sums = self._pool.array(f"{self._name} block sums", (count,), "uint32")
         source = {"length": length, "values": values} | ({} if indices is None else {"indices": indices})
-        commands.dispatch(self._reduce, count, **source, block_sums=sums)
+        if count > 1:
+            commands.dispatch(self._reduce, count, **source, block_sums=sums)
         commands.dispatch(self._apply, count, **source, block_sums=sums, prefix=prefix, total=total)

@@ -10,7 +10,6 @@ from lapgs_wgpu.gpu.pool import BufferPool
 def sum_columns(
     commands: Commands,
     pool: BufferPool,
-    name: str,
     values: DeviceArray,
     totals: DeviceArray,
     *,
@@ -18,10 +17,7 @@ def sum_columns(
     place: int = 0,
     factor: float = 1.0,
 ) -> None:
-    """Record the sums of the columns of values, times a factor, into `totals` from `place` on.
-
-    name: of the sums' uniform in the pool.
-    """
+    """Record the sums of the columns of values, times a factor, into `totals` from `place` on."""
     kernel = Kernel.get(commands.device, "sum_values")
     content = kernel.uniform("Values", rows=values.size // columns, columns=columns, place=place, factor=factor)
-    commands.dispatch(kernel, columns, sum=pool.constant(f"sums {name}", content), values=values, totals=totals)
+    commands.dispatch(kernel, columns, sum=pool.constant(content), values=values, totals=totals)

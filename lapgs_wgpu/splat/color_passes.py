@@ -44,4 +44,4 @@ class ColorPasses:
         for first in range(0, count, most):
             rows = colors.rows(first, min(most, count - first))
             content = kernel.uniform("Part", first=first, count=rows.shape[0])
-            yield self._pool.constant(f"part {first}", content), -(-rows.shape[0] // 64), rows
+            yield self._pool.constant(content), -(-rows.shape[0] // 64), rows

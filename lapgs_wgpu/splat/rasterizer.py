@@ -16,7 +16,6 @@ from lapgs_wgpu.gpu.array import DeviceArray, read_all
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
-from lapgs_wgpu.gpu.profile import Profile
 from lapgs_wgpu.gpu.radix_sort import RadixSort
 from lapgs_wgpu.gpu.scan import Scan
 from lapgs_wgpu.splat.buffer_plan import BufferPlan, BufferPlans, roomy
@@ -67,18 +66,15 @@ class Rasterizer:
         *,
         depth: bool = False,
         gradient: bool = False,
-        profile: Profile | None = None,
     ) -> Drawing:
         """Submit the passes that draw an image, which is valid once `grow_on_overflow` has returned False.
 
         gradient: whether `backward` may follow.
         """
-        drawing = self._begin(gaussians, camera, background, depth=depth, gradient=gradient)
-        for band in range(drawing.plan.bands):
-            with Commands(self.device, profile) as commands:
-                drawing.lists = self._draw_band(commands, drawing, band)
-            if self._subgroup_mismatch("rasterize", drawing):
-                return self.draw(gaussians, camera, background, depth=depth, gradient=gradient, profile=profile)
+        with Commands(self.device) as commands:
+            drawing = self.record(commands, gaussians, camera, background, depth=depth, gradient=gradient)
+        if self._subgroup_mismatch("rasterize", drawing):
+            return self.draw(gaussians, camera, background, depth=depth, gradient=gradient)
         return drawing
 
     def record(
@@ -88,31 +84,19 @@ class Rasterizer:
         camera: Camera,
         background: tuple[float, float, float],
         move: Callable[[Commands, DeviceArray, int], DeviceArray] | None = None,
-    ) -> Drawing:
-        """Record the passes that draw an image whose gradient `record_bwd` will want, among others that are submitted
-        together. `draw` and `backward` were called before, which check the driver's subgroups. move: of the Drawing."""
-        drawing = self._begin(gaussians, camera, background, depth=False, gradient=True)
-        drawing.move = move
-        for band in range(drawing.plan.bands):
-            drawing.lists = self._draw_band(commands, drawing, band)
-        return drawing
-
-    def _begin(
-        self,
-        gaussians: Gaussians[DeviceArray],
-        camera: Camera,
-        background: tuple[float, float, float],
         *,
-        depth: bool,
-        gradient: bool,
+        depth: bool = False,
+        gradient: bool = True,
     ) -> Drawing:
+        """Record the passes that draw an image, once `draw` and `backward` have checked subgroups. move: of the
+        Drawing."""
         self.plans.turn_to((camera.width, camera.height, gradient))
         if self.config.round_splats:
             rows, columns = self._tiles(camera)
             bands = max(self.plans.now.bands, -(-rows // max(1, MAX_BAND_TILES // columns)))
             self.plans.now = replace(self.plans.now, bands=bands)
         self._drawings += 1
-        return Drawing(
+        drawing = Drawing(
             gaussians,
             camera,
             background,
@@ -122,7 +106,12 @@ class Rasterizer:
             image=self.pool.array("image", (5 if depth else 4, camera.height, camera.width)),
             splats=self.pool.array("splats", (len(gaussians), SPLAT_FLOATS)),
             needed=[self.pool.array(f"needed {band}", (3,), "uint32") for band in range(self.plans.now.bands)],
+            move=move,
         )
+        for band in range(drawing.plan.bands):
+            drawing.lists = self._draw_band(commands, drawing, band)
+            commands.flush()
+        return drawing
 
     def plan_of(self, camera: Camera) -> BufferPlan:
         """The plan by which `record` draws this camera's image next."""
@@ -165,7 +154,7 @@ class Rasterizer:
     def _draw_band(self, commands: Commands, drawing: Drawing, band: int) -> TileLists:
         device, pool, config, gaussians = self.device, self.pool, self.config, drawing.gaussians
         n, capacity, tiles = len(gaussians), drawing.plan.capacity, self._band_tiles(drawing, band)
-        frame = commands.varying(lambda: self._frame(drawing, band))
+        frame = pool.varying(f"frame {band}", lambda: self._frame(drawing, band))
         frame = drawing.frames[band] = drawing.move(commands, frame, band) if drawing.move else frame
         needed, visible = drawing.needed[band], pool.array("visible", (1,), "uint32")
         tile_counts, ids, keys, offsets = (
@@ -173,7 +162,7 @@ class Rasterizer:
         )
         tile_keys, slot_ids = (pool.array(name, (capacity,), "uint32") for name in ("tile keys", "slot ids"))
         ranges = pool.array("ranges", (tiles + 1, 4), "uint32")
-        length = pool.constant("gaussians", n.to_bytes(4, "little"))
+        length = pool.constant(n.to_bytes(4, "little"))
         arrays = gaussians.arrays() | {"frame": frame, "needed": needed}
         arrays |= {"splats": drawing.splats, "image": drawing.image}
         arrays |= {"tile_counts": tile_counts, "ids": ids, "keys": keys, "prefix": offsets, "visible": visible}
@@ -215,10 +204,10 @@ class Rasterizer:
         first, last = self._band_rows(drawing, band)
         return (last - first) * self._tiles(drawing.camera)[1]
 
-    def _frame(self, drawing: Drawing, band: int) -> DeviceArray:
+    def _frame(self, drawing: Drawing, band: int) -> bytes:
         camera = drawing.camera
         rows, columns = self._tiles(camera)
-        content = Kernel.get(self.device, "compact").uniform(
+        return Kernel.get(self.device, "compact").uniform(
             "Frame",
             view=camera.T_cam_world.T.reshape(-1).tolist(),
             focal=(camera.K[0, 0], camera.K[1, 1]),
@@ -233,7 +222,6 @@ class Rasterizer:
             antialiased=int(drawing.gaussians.antialiased),
             near=camera.near,
         )
-        return self.pool.constant(f"frame {band}", content)
 
     def _subgroup_mismatch(self, name: str, drawing: Drawing) -> bool:
         """Return whether the driver has split a pass's workgroups into several subgroups, checked after its first run.
@@ -253,9 +241,7 @@ class Rasterizer:
 
     # Backward --------------------------------------------------------------------------------------------------------
 
-    def backward(
-        self, drawing: Drawing, d_image: DeviceArray, *, camera: bool = False, profile: Profile | None = None
-    ) -> GaussianGradients:
+    def backward(self, drawing: Drawing, d_image: DeviceArray, *, camera: bool = False) -> GaussianGradients:
         """Submit the backward passes of a drawing.
 
         d_image: gradient of the image's planes, with that of alpha instead of the transmittance. camera: whether the
@@ -264,22 +250,21 @@ class Rasterizer:
         """
         if not self.holds(drawing):
             raise RuntimeError("backward needs the drawing that was drawn last; its buffers now hold another image")
-        d_splats = self.pool.array("d_splats", (len(drawing.gaussians), SPLAT_FLOATS))
-        for band in range(drawing.plan.bands):
-            with Commands(self.device, profile) as commands:
-                self._backward_band(commands, drawing, band, d_image, d_splats)
-            if self._subgroup_mismatch("rasterize_bwd", drawing):
-                return self.backward(self._drawn_again(drawing), d_image, camera=camera, profile=profile)
-        with Commands(self.device, profile) as commands:
-            return self._project_bwd(commands, drawing, d_splats, camera=camera)
+        with Commands(self.device) as commands:
+            gradients = self.record_bwd(commands, drawing, d_image, camera=camera)
+        if self._subgroup_mismatch("rasterize_bwd", drawing):
+            return self.backward(self._drawn_again(drawing), d_image, camera=camera)
+        return gradients
 
     def record_bwd(
         self, commands: Commands, drawing: Drawing, d_image: DeviceArray, *, camera: bool
     ) -> GaussianGradients:
-        """Record the backward passes of a drawing that `record` has recorded last; arguments as for `backward`."""
+        """Record the backward passes of the drawing that `record` has recorded last; arguments as for `backward`."""
         d_splats = self.pool.array("d_splats", (len(drawing.gaussians), SPLAT_FLOATS))
+        commands.clear(d_splats)
         for band in range(drawing.plan.bands):
             self._backward_band(commands, drawing, band, d_image, d_splats)
+            commands.flush()
         return self._project_bwd(commands, drawing, d_splats, camera=camera)
 
     def _project_bwd(
@@ -308,16 +293,14 @@ class Rasterizer:
 
     def _drawn_again(self, drawing: Drawing) -> Drawing:
         """Return the same image, drawn with the present config."""
-        while True:
-            again = self.draw(drawing.gaussians, drawing.camera, drawing.background, depth=drawing.depth, gradient=True)
-            if not self.grow_on_overflow(again):
-                return again
+        gaussians, camera, background, depth = drawing.gaussians, drawing.camera, drawing.background, drawing.depth
+        while self.grow_on_overflow(again := self.draw(gaussians, camera, background, depth=depth, gradient=True)):
+            pass
+        return again
 
     def _backward_band(
         self, commands: Commands, drawing: Drawing, band: int, d_image: DeviceArray, d_splats: DeviceArray
     ) -> None:
-        if band == 0:
-            commands.clear(d_splats)
         if drawing.plan.bands > 1:  # the lists of the other bands are gone
             drawing.lists = self._draw_band(commands, drawing, band)
         lists, plan = drawing.lists, drawing.plan
@@ -331,11 +314,11 @@ class Rasterizer:
         arrays = lists._asdict() | {"ids": lists.sorted_ids, "frame": drawing.frames[band]}
         arrays |= {"splats": drawing.splats, "image": drawing.image, "d_image": d_image, "d_splats": d_splats}
         arrays |= {"records": records, "record_tails": record_tails}
-        arrays["tails"] = self.pool.constant("tails", gather.uniform("Tails", capacity=plan.capacity))
+        arrays["tails"] = self.pool.constant(gather.uniform("Tails", capacity=plan.capacity))
         commands.clear(record_tails.rows(0, plan.capacity))  # no slot has a record yet
         for number in range(plan.rounds):
             if plan.rounds > 1:
                 uniform = kernel.uniform("Piece", number=number, state=tails)
-                arrays["piece"] = self.pool.constant(f"piece {number}", uniform)
+                arrays["piece"] = self.pool.constant(uniform)
             commands.run(kernel, self._band_tiles(drawing, band), arrays)
         commands.run(gather, _groups(len(drawing.gaussians)), arrays)

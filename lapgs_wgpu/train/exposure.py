@@ -78,11 +78,11 @@ class ExposurePasses:
         _, height, width = image.shape
         kernel = Kernel.get(self.device, name, LANES=self._lanes)
 
-        def uniform() -> DeviceArray:
-            content = kernel.uniform("Exposure", size=(width, height), first=first())
-            return self.pool.constant("exposure", content)
+        def write() -> bytes:
+            return kernel.uniform("Exposure", size=(width, height), first=first())
 
-        commands.dispatch_grid(kernel, (1, height), exposure=commands.varying(uniform), image=image, **arrays)
+        exposure = self.pool.varying("exposure", write)
+        commands.dispatch_grid(kernel, (1, height), exposure=exposure, image=image, **arrays)
 
 
 class Exposures:

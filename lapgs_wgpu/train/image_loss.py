@@ -151,19 +151,11 @@ class _Frame:
         pixel = 1.0 / (3 * height * width)
         window = 1.0 / max(1, self.ncc_windows)
         per_pixel = window / NCC_WINDOW**2
-        self.picture = owner.pool.constant(
-            "picture",
-            owner.kernel("loss_pixels").uniform(
-                "Picture",
-                size=(width, height),
-                run=owner._run,
-                ssim_first=self.ends[1],
-                background=background,
-                ncc_first=self.ends[3],
-                value=(pixel, pixel, window, 0.0),
-                slope=((weights.l1 + self.flat_pyramid) * pixel, weights.ssim * pixel, weights.ncc * per_pixel, 0.0),
-            ),
-        )
+        kernel = owner.kernel("loss_pixels")
+        slope = (weights.l1 + self.flat_pyramid) * pixel, weights.ssim * pixel, weights.ncc * per_pixel, 0.0
+        given = {"size": (width, height), "run": owner._run, "background": background, "slope": slope}
+        given |= {"ssim_first": self.ends[1], "ncc_first": self.ends[3], "value": (pixel, pixel, window, 0.0)}
+        self.picture = owner.pool.varying("picture", lambda: kernel.uniform("Picture", **given))
 
     def runs(self, length: int) -> int:
         return -(-length // self.owner._run)
@@ -238,7 +230,6 @@ class _Frame:
             reduce = owner.kernel("loss_pyramid_reduce", **finest)
             band = owner.kernel("loss_pyramid_band", **finest, **residual)
             uniform = owner.pool.constant(
-                f"level {k}",
                 band.uniform(
                     "Level",
                     fine=(fine_width, fine_height),
@@ -298,6 +289,6 @@ class _Frame:
         parts = dict(zip(names, zip([0, *self.ends], self.ends, strict=False), strict=True))
         if self.flat_pyramid:
             parts["pyramid"] = parts["l1"]
-        uniform = self.owner.pool.constant("parts", kernel.uniform("Parts", **parts))
+        uniform = self.owner.pool.constant(kernel.uniform("Parts", **parts))
         self.commands.dispatch_grid(kernel, (TERMS, 1), parts=uniform, sums=self.sums, terms=terms)
         return terms

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import torch
 from torch import Tensor
 
@@ -98,12 +96,11 @@ class ResidentCorrections:
             return frame
         kernel = Kernel.get(self._device, "move_camera")
 
-        def uniform() -> DeviceArray:
-            content = kernel.uniform("Moved", row=cameras.numbers[self._view.camera], unit=cameras.extent)
-            return self._pool.constant("moved", content)
+        def write() -> bytes:
+            return kernel.uniform("Moved", row=cameras.numbers[self._view.camera], unit=cameras.extent)
 
         moved = self._pool.array(f"frame {band}", frame.shape, frame.dtype)
-        given = {"moved": commands.varying(uniform), "placed": frame, "cameras": self._value("cameras")}
+        given = {"moved": self._pool.varying("moved", write), "placed": frame, "cameras": self._value("cameras")}
         commands.dispatch(kernel, 1, **given, frame=moved)
         return moved
 
@@ -118,7 +115,7 @@ class ResidentCorrections:
         if self._exposures is None:
             return d_exposed
         back = self._exposing.record_bwd(commands, image, d_exposed, self._value("exposures"), self._first_row)
-        sum_columns(commands, self._pool, "exposure", back.d_rows, self._d_exposure, columns=12)
+        sum_columns(commands, self._pool, back.d_rows, self._d_exposure, columns=12)
         return back.d_image
 
     def sum_camera(self, commands: Commands, sums: DeviceArray | None) -> None:
@@ -126,13 +123,13 @@ class ResidentCorrections:
         if sums is None or self._cameras is None:
             return
         for half, factor in enumerate((-1.0, -self._cameras.extent)):
-            name, rows, total = f"camera {half}", sums.rows(half, 1), self._d_camera
-            sum_columns(commands, self._pool, name, rows, total, columns=4, place=4 * half, factor=factor)
+            rows, total = sums.rows(half, 1), self._d_camera
+            sum_columns(commands, self._pool, rows, total, columns=4, place=4 * half, factor=factor)
 
     def record_check(self, commands: Commands, bad: DeviceArray) -> None:
         """Record the search for gradients that are not finite."""
-        for name, gradient in self._gradients():
-            check_finite(commands, self._pool, name, gradient, bad)
+        for gradient in self._gradients().values():
+            check_finite(commands, self._pool, gradient, bad)
 
     def record_step(self, commands: Commands, guard: DeviceArray, frame: DeviceArray, geometry: DeviceArray) -> None:
         """Record a step of the corrections, after the one of the Gaussians. frame: that `move` gave; geometry: (N, 12)
@@ -143,42 +140,38 @@ class ResidentCorrections:
             return
         kernel = Kernel.get(self._device, "exposure_step")
 
-        def uniform() -> DeviceArray:
+        def write() -> bytes:
             count, rate = len(exposures.values), exposures.rate.at(self._step)
-            content = kernel.uniform("ExposureStep", number=self._numbers[self._view.name], count=count, rate=rate)
-            return self._pool.constant("exposure step", content)
+            return kernel.uniform("ExposureStep", number=self._numbers[self._view.name], count=count, rate=rate)
 
         arrays = {"guard": guard, "d_exposure": self._d_exposure, "exposures": self._value("exposures")}
-        commands.dispatch(kernel, 1, descent=commands.varying(uniform), **arrays)
+        commands.dispatch(kernel, 1, descent=self._pool.varying("exposure step", write), **arrays)
 
     def _step_camera(self, commands: Commands, guard: DeviceArray, frame: DeviceArray, geometry: DeviceArray) -> None:
         cameras, count = self._cameras, geometry.shape[0]
         assert cameras is not None
         motion, motion_kernel = self._pool.array("motion", (_MOTION_FLOATS,)), Kernel.get(self._device, "image_motion")
         content = motion_kernel.uniform("Seen", gaussians=count, spacing=-(-count // MOST_POINTS), unit=cameras.extent)
-        seen = self._pool.constant("seen", content)
+        seen = self._pool.constant(content)
         commands.dispatch(motion_kernel, 1, seen=seen, frame=frame, geometry=geometry, motion=motion)
         kernel = Kernel.get(self._device, "camera_step")
 
-        def uniform() -> DeviceArray:
+        def write() -> bytes:
             assert self._pace is not None
             number, pace = cameras.numbers[self._view.camera], self._pace._asdict()
-            content = kernel.uniform("CameraStep", number=number, cameras=len(cameras.numbers), **pace)
-            return self._pool.constant("camera step", content)
+            return kernel.uniform("CameraStep", number=number, cameras=len(cameras.numbers), **pace)
 
         arrays = {"guard": guard, "motion": motion, "d_camera": self._d_camera, "common_motions": self._common}
-        descent = commands.varying(uniform)
+        descent = self._pool.varying("camera step", write)
         commands.dispatch(kernel, 1, descent=descent, cameras=self._value("cameras"), **arrays)
 
     def gradients(self) -> dict[str, list[Tensor]]:
         """Of the view's corrections, read back; for the text of an error."""
-        return {name: [torch.from_numpy(gradient.read())] for name, gradient in self._gradients()}
+        return {name: [torch.from_numpy(gradient.read())] for name, gradient in self._gradients().items()}
 
-    def _gradients(self) -> Iterator[tuple[str, DeviceArray]]:
-        if self.moves_camera:
-            yield "cameras", self._d_camera
-        if self._exposures is not None:
-            yield "exposures", self._d_exposure
+    def _gradients(self) -> dict[str, DeviceArray]:
+        found = {"cameras": self._d_camera} if self.moves_camera else {}
+        return found | ({"exposures": self._d_exposure} if self._exposures is not None else {})
 
     def _value(self, name: str) -> DeviceArray:
         return self._blocks[name][0].arrays["value"]

@@ -15,14 +15,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lapgs_wgpu.gpu.array import DeviceArray, read_all
+from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.fields.laplacian import VARIANCE_FLOOR, VARIANCE_SPREAD
 from lapgs_wgpu.motion.passes.activation_passes import GEOMETRY_FLOATS, SH_FLOATS
-from lapgs_wgpu.motion.passes.field_weights import FieldWeights, Segment
+from lapgs_wgpu.motion.passes.field_weights import ALIGNED, FieldWeights
 from lapgs_wgpu.motion.passes.grid_field_passes import FieldArrays
 from lapgs_wgpu.train.optimizer import LARGEST_FREQUENCY_STEP, AdamState, FrequencyOptimizer, Optimizer
 
@@ -45,6 +45,7 @@ class Block:
         moved: number of values that Adam moves; the others have an optimizer of their own.
         moving: whether only steps with motion move them.
         of: the Gaussians or the field, see PARTS.
+        first: number of the part's array.
         arrays: by kind.
     """
 
@@ -56,6 +57,7 @@ class Block:
     moved: int | None = None
     moving: bool = True
     of: str = "gaussians"
+    first: int = 0
     arrays: dict[str, DeviceArray] = field(default_factory=dict)
 
     @property
@@ -102,6 +104,7 @@ class ResidentParameters:
         self._field = dict(field_module.named_parameters()) if field_module is not None else {}
         self._weights = weights
         self.blocks: dict[str, Block] = {}
+        self._arrays: dict[tuple[str, str], DeviceArray] = {}  # of all blocks together, by part and kind
         self.steps: dict[str, int] = {}
         # The parts that the host may have changed since they were pushed: their values, the optimizers' state of them.
         self.values_on_host, self.state_on_host = set(PARTS), set(PARTS)
@@ -113,15 +116,31 @@ class ResidentParameters:
         chosen = {"gaussians": self._gaussians, "field": self._field}
         return {name: tensor for part in parts or PARTS for name, tensor in chosen[part].items()}
 
-    def _blocks_of(self, part: str) -> list[Block]:
-        return [block for block in self.blocks.values() if block.of == part]
-
-    def _layout(self, part: str) -> dict[str, Block]:
-        """The blocks of a part, with arrays for its tensors as they are."""
-        blocks = self._gaussians_layout() if part == "gaussians" else self._field_layout()
+    def _lay_out(self, part: str) -> None:
+        """Make arrays for the tensors of a part as they are."""
+        blocks, size = self._gaussians_layout() if part == "gaussians" else self._field_layout(), 0
         for block in blocks:
-            block.arrays = {kind: self._pool.array(f"{block.name} {kind}", block.shape) for kind in KINDS}
-        return {block.name: block for block in blocks}
+            block.first, size = size, size + -(-math.prod(block.shape) // ALIGNED) * ALIGNED
+        for kind in KINDS:
+            array = self._arrays[part, kind] = self._pool.array(f"{part} {kind}", (size,))
+            for block in blocks:
+                block.arrays[kind] = DeviceArray(array.buffer, block.shape, offset=4 * block.first)
+        self.blocks |= {block.name: block for block in blocks}
+
+    def _write(self, part: str, kind: str, tensors: Mapping[str, Tensor | None]) -> None:
+        """Upload all of a kind; tensors that are None are zeros."""
+        content = np.zeros(self._arrays[part, kind].shape, np.float32)
+        for block in [block for block in self.blocks.values() if block.of == part]:
+            values = block.gather(tensors, value=kind == "value").reshape(-1)
+            content[block.first : block.first + len(values)] = values
+        self._arrays[part, kind].write(content)
+
+    def _read(self, part: str, kind: str, into: Mapping[str, Tensor]) -> None:
+        """Copy all of a kind into tensors."""
+        content = self._arrays[part, kind].read()
+        for block in [block for block in self.blocks.values() if block.of == part]:
+            values = content[block.first : block.first + math.prod(block.shape)]
+            block.scatter(values.reshape(block.shape), into)
 
     def _gaussians_layout(self) -> list[Block]:
         n, every = len(self._gaussians["means"]), slice(None)
@@ -133,9 +152,9 @@ class ResidentParameters:
             Block("sh", (n, SH_FLOATS), None, colors, moving=False),
         ]
         if self._weights is not None:
-            beside = self._weights.shape.beside
-            dynamics = {"dynamics": (every, slice(0, beside - 1))} if "dynamics" in self._gaussians else {}
-            blocks.append(Block("beside", (n, beside), None, dynamics, ones=True))
+            size = self._weights.dynamics
+            dynamics = {"dynamics": (every, slice(0, size))} if "dynamics" in self._gaussians else {}
+            blocks.append(Block("beside", (n, size + 1), None, dynamics, ones=True))
         return blocks
 
     def _field_layout(self) -> list[Block]:
@@ -154,9 +173,8 @@ class ResidentParameters:
     def push_values(self) -> None:
         """Upload the values that the host may have changed."""
         for part in [part for part in PARTS if part in self.values_on_host]:
-            self.blocks |= self._layout(part)
-            for block in self._blocks_of(part):
-                block.arrays["value"].write(block.gather(self._tensors(part), value=True))
+            self._lay_out(part)
+            self._write(part, "value", self._tensors(part))
 
     def push(self) -> None:
         """Upload what the host may have changed; from now on the device has the newest."""
@@ -165,9 +183,7 @@ class ResidentParameters:
             state = {name: self._optimizer.state_of(tensor) for name, tensor in self._tensors(part).items()}
             self.steps |= {name: each.steps if each else 0 for name, each in state.items()}
             for kind in ("mean", "square"):
-                moments = {name: getattr(each, kind) if each else None for name, each in state.items()}
-                for block in self._blocks_of(part):
-                    block.arrays[kind].write(block.gather(moments, value=False))
+                self._write(part, kind, {name: getattr(each, kind, None) for name, each in state.items()})
             if part == "field" and self._frequencies is not None:
                 content, self.steps[FREQUENCIES] = self._frequencies.packed()
                 self._pool.upload("frequencies", content)
@@ -178,28 +194,23 @@ class ResidentParameters:
         """Make torch's tensors of some parts, of all if none is named, the newest ones."""
         for part in set(parts or PARTS) - self.values_on_host:
             self.values_on_host.add(part)
-            tensors, blocks = self._tensors(part), self._blocks_of(part)
-            for block, content in zip(blocks, read_all([b.arrays["value"] for b in blocks]), strict=True):
-                block.scatter(content, tensors)
+            self._read(part, "value", self._tensors(part))
 
     @torch.no_grad()
     def pull_state(self, *parts: str) -> None:
         """Make torch's state of the optimizers of some parts, of all if none is named, the newest one."""
         for part in set(parts or PARTS) - self.state_on_host:
             self.state_on_host.add(part)
-            self._pull_state(part)
-
-    def _pull_state(self, part: str) -> None:
-        tensors, blocks = self._tensors(part), self._blocks_of(part)
-        both = [{name: torch.zeros_like(tensor) for name, tensor in tensors.items()} for _ in range(2)]
-        for kind, into in zip(("mean", "square"), both, strict=True):
-            for block, content in zip(blocks, read_all([b.arrays[kind] for b in blocks]), strict=True):
-                block.scatter(content, into)
-        for name, tensor in tensors.items():
-            if self.steps[name] and name != FREQUENCIES:
-                self._optimizer.set_state(tensor, AdamState(self.steps[name], both[0][name], both[1][name]))
-        if part == "field" and self._frequencies is not None:
-            self._frequencies.unpack(self._pool.array("frequencies", self._state_shape).read(), self.steps[FREQUENCIES])
+            tensors = self._tensors(part)
+            means, squares = ({name: torch.zeros_like(tensor) for name, tensor in tensors.items()} for _ in range(2))
+            self._read(part, "mean", means)
+            self._read(part, "square", squares)
+            for name, tensor in tensors.items():
+                if self.steps[name] and name != FREQUENCIES:
+                    self._optimizer.set_state(tensor, AdamState(self.steps[name], means[name], squares[name]))
+            if part == "field" and self._frequencies is not None:
+                content = self._pool.array("frequencies", self._state_shape).read()
+                self._frequencies.unpack(content, self.steps[FREQUENCIES])
 
     @property
     def _state_shape(self) -> tuple[int]:
@@ -226,13 +237,13 @@ class ResidentParameters:
 
     def clear_gradients(self, commands: Commands) -> None:
         """Record zeros for the gradients, which each step of Adam leaves."""
-        for block in self.blocks.values():
-            commands.clear(block.arrays["gradient"])
+        for part in PARTS:
+            commands.clear(self._arrays[part, "gradient"])
 
     def record_check(self, commands: Commands, bad: DeviceArray, *, moving: bool) -> None:
         """Record the search for gradients that are not finite."""
-        for block in self._moved(moving=moving):
-            check_finite(commands, self._pool, block.name, block.arrays["gradient"], bad)
+        for part in PARTS if moving else PARTS[:1]:
+            check_finite(commands, self._pool, self._arrays[part, "gradient"], bad)
 
     def count_step(self, *, moving: bool) -> None:
         """A step that moves the parameters is about to be recorded."""
@@ -240,96 +251,76 @@ class ResidentParameters:
             for name in block.parts:
                 self.steps[name] += 1
 
-    def write_rates(self, rates: Mapping[str, float], *, moving: bool) -> None:
-        """Upload the learning rates of a step. rates: of the optimizer's groups."""
-        table: list[tuple[float, float]] = []
+    def _rates(self, rates: Mapping[str, float], *, moving: bool) -> bytes:
+        """The corrected rates of a step, a pair for each column that has its own. rates: of the optimizer's groups."""
+        table, first = np.zeros((_MOST_RATES, 2), np.float32), 0
         for block in self._moved(moving=moving):
             columns = block.rate_columns
-            rows = [(0.0, 0.0)] * columns
             for name, (_, place) in block.parts.items():
                 if name != FREQUENCIES:
-                    rows[place if columns > 1 else slice(None)] = [
-                        _corrected(rates[block.group or name], self.steps[name])
-                    ] * len(range(columns)[place])
-            table += rows
-        self._pool.array("rates", (_MOST_RATES, 2)).rows(0, len(table)).write(np.array(table, np.float32))
+                    own = table[first : first + columns]
+                    own[place if columns > 1 else 0] = _corrected(rates[block.group or name], self.steps[name])
+            first += columns
+        return table[:first].tobytes()
 
     def record_adam(
-        self, commands: Commands, guard: DeviceArray, frequency_rate: Callable[[], float], *, moving: bool
+        self,
+        commands: Commands,
+        guard: DeviceArray,
+        rates_of: Callable[[], Mapping[str, float]],
+        frequency_rate: Callable[[], float],
+        *,
+        moving: bool,
     ) -> None:
-        """Record a step of the optimizers, by the rates that were written."""
+        """Record a step of the optimizers, by the rates of its groups and of the frequencies."""
         kernel, first = Kernel.get(self._device, "adam"), 0
-        rates = self._pool.array("rates", (_MOST_RATES, 2))
+        written = self._pool.varying(f"rates {moving}", lambda: self._rates(rates_of(), moving=moving))
+        rates = DeviceArray(written.buffer, (written.nbytes // 8, 2), offset=written.offset)
         for block in self._moved(moving=moving):
             count = block.arrays["value"].size if block.moved is None else block.moved
             content = kernel.uniform("Adam", count=count, columns=block.rate_columns, first=first)
             first += block.rate_columns
-            commands.dispatch(
-                kernel,
-                -(-count // 256),
-                adam=self._pool.constant(f"adam {block.name}", content),
-                guard=guard,
-                rates=rates,
-                gradients=block.arrays["gradient"],
-                values=block.arrays["value"],
-                means=block.arrays["mean"],
-                squares=block.arrays["square"],
-            )
+            arrays = {name: block.arrays[name[:-1]] for name in ("gradients", "values", "means", "squares")}
+            adam = self._pool.constant(content)
+            commands.dispatch(kernel, -(-count // 256), adam=adam, guard=guard, rates=rates, **arrays)
         if moving and self._frequencies is not None:
             self._record_frequencies(commands, guard, frequency_rate)
 
     def _record_frequencies(self, commands: Commands, guard: DeviceArray, rate: Callable[[], float]) -> None:
         assert self._weights is not None
         assert self._frequencies is not None
-        kernel, places = Kernel.get(self._device, "adam_frequencies"), self._weights.places
-        config, limit = self._weights.config, self._frequencies.limit
+        kernel, config = Kernel.get(self._device, "adam_frequencies"), self._weights.config
+        given = {name: self._weights.places[f"motion.{name}"].first for name in ("alpha", "beta", "frequencies")}
+        given |= {"width": config.width, "components": config.components}
+        bounds = {"limit": self._frequencies.limit, "largest": LARGEST_FREQUENCY_STEP}
+        bounds |= {"floor": VARIANCE_FLOOR, "spread": VARIANCE_SPREAD}
 
-        def write() -> DeviceArray:
+        def write() -> bytes:
             corrected, factor = _corrected(rate(), self.steps[FREQUENCIES])
-            content = kernel.uniform(
-                "Frequencies",
-                width=config.width,
-                components=config.components,
-                alpha=places["motion.alpha"].first,
-                beta=places["motion.beta"].first,
-                frequencies=places[FREQUENCIES].first,
-                rate=corrected,
-                square_factor=factor,
-                limit=limit,
-                largest=LARGEST_FREQUENCY_STEP,
-                floor=VARIANCE_FLOOR,
-                spread=VARIANCE_SPREAD,
-            )
-            return self._pool.constant("frequencies uniform", content)
+            return kernel.uniform("Frequencies", rate=corrected, square_factor=factor, **given, **bounds)
 
-        commands.dispatch(
-            kernel,
-            1,
-            spectrum=commands.varying(write),
-            guard=guard,
-            d_weights=self.flat_weights("gradient"),
-            weights=self.flat_weights("value"),
-            state=self._pool.array("frequencies", self._state_shape),
+        spectrum, state = (
+            self._pool.varying("frequencies uniform", write),
+            self._pool.array("frequencies", self._state_shape),
         )
+        weights = {"weights": self.flat_weights("value"), "d_weights": self.flat_weights("gradient")}
+        commands.dispatch(kernel, 1, spectrum=spectrum, guard=guard, state=state, **weights)
 
     def gradients(self) -> dict[str, list[Tensor]]:
         """Of each tensor, read back; for the text of an error."""
         tensors = {name: torch.zeros_like(tensor) for name, tensor in self._tensors().items()}
-        for block in self.blocks.values():
-            block.scatter(block.arrays["gradient"].read(), tensors)
+        for part in PARTS:
+            self._read(part, "gradient", tensors)
         return {name: [tensor] for name, tensor in tensors.items()}
 
 
-def check_finite(commands: Commands, pool: BufferPool, name: str, values: DeviceArray, bad: DeviceArray) -> None:
-    """Record that `bad` becomes odd where a value is not finite. name: of the uniform in the pool."""
-    kernel = Kernel.get(commands.device, "check_finite")
-    uniform = pool.constant(f"check {name}", kernel.uniform("Check", count=values.size))
-    commands.dispatch(kernel, -(-values.size // 1024), check=uniform, values=values, bad=bad)
-
-
-def _view(flat: Tensor, place: Segment) -> Tensor:
-    """A parameter among a field's weights."""
-    return flat[place.first : place.first + math.prod(place.shape)].reshape(place.shape)
+def check_finite(commands: Commands, pool: BufferPool, values: DeviceArray, bad: DeviceArray) -> None:
+    """Record that `bad` becomes odd where a value is not finite."""
+    kernel, most = Kernel.get(commands.device, "check_finite"), commands.device.max_binding // 1024 * 256
+    for first in range(0, values.size, most):
+        part = DeviceArray(values.buffer, (min(most, values.size - first),), offset=values.offset + 4 * first)
+        uniform = pool.constant(kernel.uniform("Check", count=part.size))
+        commands.dispatch(kernel, -(-part.size // 1024), check=uniform, values=part, bad=bad)
 
 
 def _corrected(rate: float, steps: int) -> tuple[float, float]:

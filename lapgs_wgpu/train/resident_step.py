@@ -7,7 +7,6 @@ then mends the cause, and takes these steps again.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections import deque
 from collections.abc import Callable
@@ -18,7 +17,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lapgs_wgpu.data.views import View
 from lapgs_wgpu.errors import NumericalError
 from lapgs_wgpu.gpu.array import read_all
 from lapgs_wgpu.gpu.kernel import Commands
@@ -36,7 +34,7 @@ from lapgs_wgpu.train.motion_losses import even_times, near_time
 from lapgs_wgpu.train.nonfinite import Skipped, cause, check_parameters
 from lapgs_wgpu.train.resident_parameters import PARTS
 from lapgs_wgpu.train.resident_passes import ResidentPasses
-from lapgs_wgpu.train.resident_task import ResidentSample, Task
+from lapgs_wgpu.train.resident_task import Task
 from lapgs_wgpu.train.step_result import Measured, Scheduled
 from lapgs_wgpu.train.view_order import Draws
 
@@ -45,28 +43,37 @@ _RING_BYTES = 8192
 _OVERFLOW = 1 << 31  # close_guard.wgsl
 
 
-class _Flying(NamedTuple):
-    """A step that was submitted."""
+class Flying:
+    """A step that was submitted; called, it waits, and gives what the step told.
 
-    task: Task
+    Attributes:
+        task: that it is.
+        drawing, later: its image, and what it tells.
+    """
+
     drawing: Drawing
     later: Later
-    result: Pending
+    value: Measured | None = None
 
-
-class Pending:
-    """What a step will have told."""
-
-    def __init__(self, settle: Callable[[], None]) -> None:
-        self._settle, self.value = settle, None
-
-    value: Measured | None
+    def __init__(self, task: Task, settle: Callable[[], None]) -> None:
+        self.task, self._settle = task, settle
 
     def __call__(self) -> Measured:
-        """Wait for the step."""
         while self.value is None:
             self._settle()
         return self.value
+
+
+class _Told(NamedTuple):
+    """What a step tells. guard: 0, or the step at which it was closed; bad: why; dead: number of scales at the floor;
+    terms, totals: of the losses of the image, and of motion; needed: of each band's intersections."""
+
+    guard: int
+    bad: int
+    dead: int
+    terms: NDArray[np.float32]
+    totals: NDArray[np.float32]
+    needed: list[NDArray[np.uint32]]
 
 
 class ResidentStep:
@@ -92,7 +99,7 @@ class ResidentStep:
         self._passes = ResidentPasses(config, scene, learners)
         self.parameters = self._passes.parameters
         self._ring = Ring(scene.device, _RING_BYTES)
-        self._flying: deque[_Flying] = deque()
+        self._flying: deque[Flying] = deque()
         self._statistics_on_host = True
         self.field_fitted = False
         self.settled = 0
@@ -148,47 +155,42 @@ class ResidentStep:
         """Number of Gaussians."""
         return len(self._scene)
 
-    def take(self, scheduled: Scheduled, began: Callable[[], None]) -> Pending:
+    def take(self, scheduled: Scheduled, began: Callable[[], None]) -> Flying:
         """Submit a step, after `make_room`; what it will have told. began: called when it is submitted."""
         task = self._task(scheduled, self._scene.sh_degree)
         self._push()
         if not self._flying:
             self.settled = scheduled.step - 1
-        flying = self._submit(task, Pending(self._settle_first))
+        flying = self._submit(Flying(task, self._settle_first))
         self._flying.append(flying)
         began()
-        return flying.result
+        return flying
 
     def _task(self, scheduled: Scheduled, sh_degree: int) -> Task:
-        """Draw for a step."""
+        """Draw what a step looks at."""
         step, draws, frequencies = scheduled.step, self._draws, self._learners.frequencies
         before, (view, background), drawn = draws.mark(), draws.next(), draws.mark()
-        sample = self._draw(view, background, step, draws.generator, moving=scheduled.moving)
-        self._truth.prefetch([view, *draws.coming(AHEAD)])
-        rates = self._learners.optimizer.rates_at(step, scheduled.share)
-        frequency_rate = frequencies.rate.at(step) if frequencies else 0.0
-        time = self._scene.timing(view.time)
-        return Task(scheduled, before, drawn, sample, time, sh_degree, rates, frequency_rate)
-
-    def _draw(
-        self, view: View, background: Tensor, step: int, generator: torch.Generator, *, moving: bool
-    ) -> ResidentSample:
-        """Draw what a step, counted from 1, looks at."""
-        config, count, t = self._config, self.count, self._scene.timing(view.time)
         red, green, blue = background.tolist()
-        sample = ResidentSample(view, (red, green, blue))
-        if not moving or not self._passes.moves or step <= config.smoothness.start:
-            return sample
-        smooth, even = config.smoothness, config.acceleration
+        rates, time = self._learners.optimizer.rates_at(step, scheduled.share), self._scene.timing(view.time)
+        frequency_rate = frequencies.rate.at(step) if frequencies else 0.0
+        color = red, green, blue
+        task = Task(scheduled, before, drawn, view, color, time, sh_degree, rates, frequency_rate)
+        if scheduled.moving and self._passes.moves and step > self._config.smoothness.start:
+            self._draw(task, step, draws.generator)
+        self._truth.prefetch([view, *draws.coming(AHEAD)])
+        return task
+
+    def _draw(self, task: Task, step: int, generator: torch.Generator) -> None:
+        """Draw the samples of the losses of motion."""
+        smooth, even, count = self._config.smoothness, self._config.acceleration, self.count
         near_count, even_count = round(smooth.share * count), round(even.share * count)
         if near_count and (smooth.static or smooth.temporal):
-            near = Samples(near_count, count, *_draw_rows(count, generator), smooth.reach)
-            sample = dataclasses.replace(sample, near=near, near_time=near_time(smooth, t, generator))
+            task.near = Samples(near_count, count, *_draw_rows(count, generator), smooth.reach)
+            task.near_time = near_time(smooth, task.time, generator)
         left_out = self.field_fitted or step % even.interval or not even.weight or self._time_count < 3
         if even_count and not left_out:
-            samples = Samples(even_count, count, *_draw_rows(count, generator))
-            sample = dataclasses.replace(sample, even=samples, even_times=even_times(t, self._time_count, generator))
-        return sample
+            task.even = Samples(even_count, count, *_draw_rows(count, generator))
+            task.even_times = even_times(task.time, self._time_count, generator)
 
     def _push(self) -> None:
         self.parameters.push()
@@ -217,28 +219,26 @@ class ResidentStep:
             raise
 
     def _settle(self) -> None:
-        flying = self._flying[0]
-        words, terms, totals, needed = self._told(flying)
-        if not words["guard"]:
-            self._passes.rasterizer.grow_on_overflow(flying.drawing, needed)
+        first = self._flying[0]
+        told = self._told(first)
+        if not told.guard:
+            self._passes.rasterizer.grow_on_overflow(first.drawing, told.needed)
             self._flying.popleft()
-            self.settled = flying.task.scheduled.step
-            self.dead_scales = int(words["dead"]) / max(1, 3 * self.count)
-            flying.result.value = self._measured(flying.task, terms, totals, None)
-            self.tell(flying.result.value)
+            self.dead_scales = told.dead / max(1, 3 * self.count)
+            self._tell(first, told, "")
             return
         behind = self._ground()
-        if words["bad"] & _OVERFLOW:
-            self._passes.rasterizer.grow_on_overflow(flying.drawing, needed)
-            self._again([(each.task, each.result) for each in behind])
+        if told.bad & _OVERFLOW:
+            self._passes.rasterizer.grow_on_overflow(first.drawing, told.needed)
+            self._again(behind)
             return
         # Not finite. The gradients are gone that were: this step alone once more, behind the closed guard.
-        self._passes.word("guard").write(np.array([flying.task.scheduled.step], np.uint32))
-        self._told(self._submit(flying.task, flying.result, judged=True))
+        self._passes.word("guard").write(np.array([first.task.scheduled.step], np.uint32))
+        self._told(self._submit(first, judged=True))
         gradients = self.parameters.gradients() | self._passes.corrections.gradients()
         with Commands(self._scene.device) as commands:
             self.parameters.clear_gradients(commands)
-        self.parameters.steps = dict(flying.task.counts)
+        self.parameters.steps = dict(first.task.counts)
         self.to_host()
         try:
             check_parameters(self._learners.parameters())
@@ -246,21 +246,17 @@ class ResidentStep:
             self.broken(None)
             raise
         self._passes.word("guard").write(np.zeros(1, np.uint32))
-        values = self._terms(flying.task, terms, totals)
-        what = cause(values, gradients)
-        skipped = Skipped(flying.task.scheduled.step, flying.task.sample.view.name, what)
-        flying.result.value = self._measured(flying.task, terms, totals, skipped)
-        self.settled = flying.task.scheduled.step
-        # No random number was drawn for the sample of a step that is skipped.
-        self._draws.go_back(flying.task.drawn)
+        # No random number was drawn for the samples of a step that is skipped.
+        self._draws.go_back(first.task.drawn)
         for each in behind[1:2]:
-            each.task.before = flying.task.drawn
-        self.tell(flying.result.value)
-        tasks = [self._task(each.task.scheduled, each.task.sh_degree) for each in behind[1:]]
+            each.task.before = first.task.drawn
+        self._tell(first, told, cause(self._terms(first.task, told), gradients))
+        for each in behind[1:]:
+            each.task = self._task(each.task.scheduled, each.task.sh_degree)
         self._push()
-        self._again(list(zip(tasks, [each.result for each in behind[1:]], strict=True)))
+        self._again(behind[1:])
 
-    def _ground(self) -> list[_Flying]:
+    def _ground(self) -> list[Flying]:
         """All steps in flight, which have changed nothing; none is in flight any more, and the guard is open."""
         behind = list(self._flying)
         self._flying.clear()
@@ -270,49 +266,48 @@ class ResidentStep:
         self.parameters.steps = dict(behind[0].task.counts)
         return behind
 
-    def _again(self, tasks: list[tuple[Task, Pending]]) -> None:
-        for task, result in tasks:
-            self._flying.append(self._submit(task, result))
+    def _again(self, steps: list[Flying]) -> None:
+        for each in steps:
+            self._flying.append(self._submit(each))
 
-    def _told(
-        self, flying: _Flying
-    ) -> tuple[dict[str, np.uint32], NDArray[np.float32], NDArray[np.float32], list[NDArray[np.uint32]]]:
+    def _told(self, flying: Flying) -> _Told:
         guard, bad, dead, terms, totals, *needed = flying.later.read()
-        return {"guard": guard[0], "bad": bad[0], "dead": dead[0]}, terms, totals, needed
+        return _Told(int(guard[0]), int(bad[0]), int(dead[0]), terms, totals, needed)
 
-    def _terms(self, task: Task, terms: NDArray[np.float32], totals: NDArray[np.float32]) -> dict[str, float]:
-        weights, values = self._passes.weights(task), terms.tolist()
+    def _terms(self, task: Task, told: _Told) -> dict[str, float]:
+        weights, values = self._passes.weights(task), told.terms.tolist()
         found = {"l1": weights.l1 * values[0]}
         for name, value in zip(("ssim", "pyramid", "ncc"), values[2:], strict=True):
             if weight := getattr(weights, name):
                 found[name] = weight * value
-        static, temporal, even, dynamics = totals.tolist()
-        if task.sample.near is not None:
+        static, temporal, even, dynamics = told.totals.tolist()
+        if task.near is not None:
             found["smoothness"] = static + temporal
-        if task.sample.even is not None:
+        if task.even is not None:
             found["acceleration"] = even
         if task.scheduled.moving and self._passes.dynamics_loss:
             found["dynamics"] = dynamics
         return found
 
-    def _measured(
-        self, task: Task, terms: NDArray[np.float32], totals: NDArray[np.float32], skipped: Skipped | None
-    ) -> Measured:
-        found = self._terms(task, terms, totals)
-        mse = float(terms[1])
-        psnr = psnr_of(mse) if math.isfinite(mse) else math.nan
-        return Measured(math.fsum(found.values()) if skipped is None else sum(found.values()), psnr, skipped, found)
+    def _tell(self, flying: Flying, told: _Told, what: str) -> None:
+        """A step is settled. what: was not finite in it, for which it was skipped."""
+        task, mse = flying.task, float(told.terms[1])
+        self.settled, found = task.scheduled.step, self._terms(task, told)
+        psnr, loss = psnr_of(mse) if math.isfinite(mse) else math.nan, sum(found.values())
+        skipped = Skipped(self.settled, task.view.name, what) if what else None
+        flying.value = Measured(loss if skipped else math.fsum(found.values()), psnr, skipped, found)
+        self.tell(flying.value)
 
-    def _submit(self, task: Task, result: Pending, *, judged: bool = False) -> _Flying:
+    def _submit(self, flying: Flying, *, judged: bool = False) -> Flying:
         """Submit a step. judged: only up to its gradients, which stay."""
-        truth, device = self._truth.on_device(task.sample.view), self._scene.device
+        task, truth = flying.task, self._truth.on_device(flying.task.view)
         self._passes.check_driver(task)
         task.counts = dict(self.parameters.steps)
-        with Commands(device, whole=True) as commands:
-            step = self._passes.record(commands, task, truth, judged=judged)
-            later = self._ring.record(commands, step.told)
-        later.submitted()
-        return _Flying(task, step.drawing, later, result)
+        with Commands(self._scene.device, whole=True) as commands:
+            flying.drawing, told = self._passes.record(commands, task, truth, judged=judged)
+            flying.later = self._ring.record(commands, told)
+        flying.later.submitted()
+        return flying
 
 
 def _draw_rows(count: int, generator: torch.Generator) -> tuple[int, int]:

@@ -10,37 +10,28 @@ from lapgs_wgpu.train.step_result import Scheduled
 from lapgs_wgpu.train.view_order import Mark
 
 
-@dataclass(frozen=True)
-class ResidentSample:
-    """What a step looks at.
-
-    view: of the training, on a background (3,). near, near_time: the places and the time that the smoothness loss
-    compares; None in steps without it. even, even_times: those of the acceleration loss.
-    """
-
-    view: View
-    background: tuple[float, float, float]
-    near: Samples | None = None
-    near_time: float = 0.0
-    even: Samples | None = None
-    even_times: tuple[float, float] = (0.0, 0.0)
-
-
 @dataclass
 class Task:
     """A step to be taken.
 
-    scheduled: what the schedule says. before, drawn: where the draws stood before its view and before its sample.
-    sample: drawn for it. time: of the field. sh_degree: of the harmonics in use. rates: of the optimizer's groups, and
-    of the frequencies. counts: how many steps had moved each tensor before.
+    scheduled: what the schedule says. before, drawn: where the draws stood before its view and before its samples.
+    view: of the training, on a background (3,). time: of the field. sh_degree: of the harmonics in use. rates: of the
+    optimizer's groups, and of the frequencies. near, near_time: the places and the time that the smoothness loss
+    compares; None in steps without it. even, even_times: those of the acceleration loss. counts: how many steps had
+    moved each tensor before.
     """
 
     scheduled: Scheduled
     before: Mark
     drawn: Mark
-    sample: ResidentSample
+    view: View
+    background: tuple[float, float, float]
     time: float
     sh_degree: int
     rates: dict[str, float]
     frequency_rate: float
+    near: Samples | None = None
+    near_time: float = 0.0
+    even: Samples | None = None
+    even_times: tuple[float, float] = (0.0, 0.0)
     counts: dict[str, int] = field(default_factory=dict)

@@ -5,7 +5,8 @@
 
 struct Gate {
     gaussians: u32,
-    width: u32,   // channels of each layer
+    width: u32,    // channels of each layer
+    biases: u32,   // the first among the weights
 }
 
 #ifdef MOTION
@@ -17,3 +18,9 @@ const FEATURES = 1u;
 #endif
 
 @group(0) @binding(0) var<uniform> gate: Gate;
+@group(0) @binding(3) var<storage, read> weights: array<f32>;
+
+// The bias of a channel of a layer.
+fn bias(layer: u32, channel: u32) -> f32 {
+    return weights[gate.biases + layer * gate.width + channel];
+}

@@ -8,10 +8,13 @@ struct Spectrum {
     frequencies: u32,    // (components,), cycles over the clip
     second: u32,         // (width, width)
     second_bias: u32,    // (width,)
-    heads: u32,          // (MOVED, width): the heads that the motion reaches
-    columns: u32,        // of the packed heads: 2 x width
+    heads: u32,          // (outputs, width), of which the motion reaches the first MOVED
+    head_biases: u32,    // (outputs,)
+    outputs: u32,
+    columns: u32,        // of the folded heads: width, with motion 2 x width
     time: f32,
     unit: f32,           // of lengths: the factor of shifts and of changes of scale
+    appearance: f32,     // the factor of what changes the look
 }
 
 const MOVED = 14u;
@@ -26,5 +29,5 @@ fn phase(frequency: f32, time: f32) -> vec2<f32> {
 
 fn head_factor(s: Spectrum, head: u32) -> f32 {
     let length = (head >= 4u && head < 7u) || head >= 11u;
-    return select(1.0, s.unit, length);
+    return select(select(1.0, s.unit, length), s.appearance, head >= MOVED);
 }

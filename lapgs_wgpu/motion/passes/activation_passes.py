@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 from lapgs_wgpu.gpu.array import DeviceArray
@@ -11,7 +10,7 @@ from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.config import GEOMETRY, FieldConfig
 from lapgs_wgpu.motion.passes.grid_field_passes import Decoding
-from lapgs_wgpu.motion.passes.samples import SamplePasses, Sampling
+from lapgs_wgpu.motion.passes.samples import SamplePasses
 from lapgs_wgpu.splat.drawing import GaussianGradients
 from lapgs_wgpu.splat.gaussians import Gaussians
 
@@ -23,16 +22,14 @@ class Line(NamedTuple):
     """Samples before and after the time of a step, which should lie on a line.
 
     Attributes:
-        sampling: gives the samples of the Gaussians.
-        before, after: they at these times.
-        share: gives that of the way from the one to the other.
+        now: all Gaussians at that time.
+        before, after: the samples.
         scale: of the gradient: the loss's weight, divided by the number of samples.
     """
 
-    sampling: Sampling
+    now: Decoding
     before: Decoding
     after: Decoding
-    share: Callable[[], float]
     scale: float
 
 
@@ -64,18 +61,12 @@ class ActivationPasses:
         """
         n, floats = geometry.shape[0], 3 * (degree + 1) ** 2
         shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
-        arrays = {name: self.pool.array(name, shape) for name, shape in shapes.items()}
+        drawn = {name: self.pool.array(name, shape) for name, shape in shapes.items()}
         colors = self.pool.array("sh", (n, floats // 3, 3))
-        given = self._moving(decoding)
-        kernel = Kernel.get(self._device, "activate", **self._defines(decoding))
-        commands.dispatch(
-            kernel, -(-n // 64), activation=self._uniform(n), geometry=geometry, dead=dead, **given, **arrays
-        )
-        color = self._color(decoding)
-        kernel = Kernel.get(self._device, "activate_sh", COLOR=bool(color))
-        uniform = self._harmonics(n, floats)
-        commands.dispatch(kernel, -(-n * SH_FLOATS // 64), harmonics=uniform, sh=sh, colors=colors, **color)
-        return Gaussians(**arrays, sh=colors, antialiased=antialiased)
+        arrays = drawn | self._moving(decoding) | {"geometry": geometry, "dead": dead, "sh": sh, "colors": colors}
+        self._dispatch(commands, "activate", n, floats, decoding, arrays)
+        self._dispatch(commands, "activate_sh", n, floats, decoding, arrays)
+        return Gaussians(**drawn, sh=colors, antialiased=antialiased)
 
     def activate_bwd(
         self,
@@ -88,34 +79,20 @@ class ActivationPasses:
         d_sh: DeviceArray,
     ) -> None:
         """Record the gradients: d_geometry is added to, d_sh written, and the decoding's outputs become theirs."""
-        n = geometry.shape[0]
-        kernel = Kernel.get(self._device, "activate_bwd", **self._defines(decoding))
-        commands.dispatch(
-            kernel,
-            -(-n // 64),
-            activation=self._uniform(n),
-            geometry=geometry,
-            opacities=drawn.opacities,
-            d_splats=by_drawn.splats,
-            d_means=by_drawn.means,
-            d_quats=by_drawn.quats,
-            d_scales=by_drawn.scales,
-            d_geometry=d_geometry,
-            **self._moving(decoding),
-        )
         assert by_drawn.sh is not None
-        color = {name: array for name, array in self._color(decoding).items() if name == "outputs"}
-        kernel = Kernel.get(self._device, "activate_sh", BACK=True, COLOR=bool(color))
-        uniform = self._harmonics(n, 3 * by_drawn.sh.shape[1])
-        commands.dispatch(kernel, -(-n * SH_FLOATS // 64), harmonics=uniform, sh=d_sh, colors=by_drawn.sh, **color)
+        n, floats = geometry.shape[0], 3 * by_drawn.sh.shape[1]
+        arrays = self._moving(decoding) | {"geometry": geometry, "opacities": drawn.opacities, "d_geometry": d_geometry}
+        arrays |= {"d_splats": by_drawn.splats, "d_means": by_drawn.means, "d_quats": by_drawn.quats}
+        arrays |= {"d_scales": by_drawn.scales, "sh": d_sh, "colors": by_drawn.sh}
+        self._dispatch(commands, "activate_bwd", n, floats, decoding, arrays)
+        self._dispatch(commands, "activate_sh", n, floats, decoding, arrays, BACK=True)
 
     def acceleration(
         self, commands: Commands, line: Line, geometry: DeviceArray, drawn: Gaussians[DeviceArray]
     ) -> DeviceArray:
         """Record the acceleration loss of each sample, without its weight: (count,)."""
         values = self.pool.array("accelerations", (line.before.points.count,))
-        kernel = Kernel.get(self._device, "acceleration")
-        self._line(commands, kernel, line, geometry, drawn, values=values)
+        self._line(commands, "acceleration", line, {"geometry": geometry, "values": values}, drawn)
         return values
 
     def acceleration_bwd(
@@ -128,56 +105,52 @@ class ActivationPasses:
         d_geometry: DeviceArray,
     ) -> None:
         """Record its gradients: added to those of the Gaussians; the outputs of both decodings become theirs."""
-        kernel = Kernel.get(self._device, "acceleration_bwd")
-        added = {"d_means": by_drawn.means, "d_scales": by_drawn.scales, "d_geometry": d_geometry}
-        self._line(commands, kernel, line, geometry, drawn, **added)
+        arrays = {"geometry": geometry, "d_geometry": d_geometry}
+        arrays |= {"d_means": by_drawn.means, "d_scales": by_drawn.scales}
+        self._line(commands, "acceleration_bwd", line, arrays, drawn)
 
     def _line(
         self,
         commands: Commands,
-        kernel: Kernel,
+        name: str,
         line: Line,
-        geometry: DeviceArray,
+        arrays: dict[str, DeviceArray],
         drawn: Gaussians[DeviceArray],
-        **more: DeviceArray,
     ) -> None:
-        def write() -> DeviceArray:
-            given = {"outputs": self._outputs, "mirror": self._mirror}
-            content = kernel.uniform("Acceleration", **given, share=line.share(), scale=line.scale)
-            return self.pool.constant("acceleration", content)
+        kernel, (now, before, after, scale) = Kernel.get(self._device, name), line
+        assert before.sampling is not None
 
-        commands.dispatch(
-            kernel,
-            -(-line.before.points.count // 64),
-            samples=self._samples.constant(commands, "line", line.sampling),
-            acceleration=commands.varying(write),
-            biases_before=line.before.biases,
-            biases_after=line.after.biases,
-            geometry=geometry,
-            means=drawn.means,
-            scales=drawn.scales,
-            before=line.before.outputs,
-            after=line.after.outputs,
-            **more,
-        )
+        def write() -> bytes:
+            share = (now.time() - before.time()) / (after.time() - before.time())
+            return kernel.uniform("Acceleration", outputs=self._outputs, mirror=self._mirror, share=share, scale=scale)
 
-    def _defines(self, decoding: Decoding | None) -> dict[str, int]:
-        moving = decoding is not None
-        return {"MOVING": moving, "OPACITY": moving and self._config.appearance_size > 3}
+        arrays |= {"means": drawn.means, "scales": drawn.scales, "before": before.outputs, "after": after.outputs}
+        arrays |= {"biases_before": before.heads.biases, "biases_after": after.heads.biases}
+        arrays["samples"] = self._samples.uniform("line", before.sampling)
+        arrays["acceleration"] = self.pool.varying("acceleration", write)
+        commands.run(kernel, -(-before.points.count // 64), arrays)
+
+    def _dispatch(
+        self,
+        commands: Commands,
+        name: str,
+        count: int,
+        floats: int,
+        decoding: Decoding | None,
+        arrays: dict[str, DeviceArray],
+        **defines: int,
+    ) -> None:
+        """Record one of the passes. floats: of the harmonics that are drawn."""
+        harmonics, appearance = name == "activate_sh", self._config.appearance_size if decoding is not None else 0
+        sizes = {"gaussians": count, "outputs": self._outputs}
+        if harmonics:
+            kernel = Kernel.get(self._device, name, COLOR=appearance > 0, **defines)
+            uniform = {"harmonics": kernel.uniform("Harmonics", floats=floats, **sizes)}
+        else:
+            kernel = Kernel.get(self._device, name, MOVING=decoding is not None, OPACITY=appearance > 3)
+            uniform = {"activation": kernel.uniform("Activate", mirror=self._mirror, **sizes)}
+        given = arrays | {key: self.pool.constant(content) for key, content in uniform.items()}
+        commands.run(kernel, -(-count * (SH_FLOATS if harmonics else 1) // 64), given)
 
     def _moving(self, decoding: Decoding | None) -> dict[str, DeviceArray]:
-        return {} if decoding is None else {"biases": decoding.biases, "outputs": decoding.outputs}
-
-    def _color(self, decoding: Decoding | None) -> dict[str, DeviceArray]:
-        """What the colors are changed by."""
-        return self._moving(decoding) if self._config.appearance_size else {}
-
-    def _uniform(self, count: int) -> DeviceArray:
-        kernel = Kernel.get(self._device, "activate")
-        content = kernel.uniform("Activate", gaussians=count, outputs=self._outputs, mirror=self._mirror)
-        return self.pool.constant("activate", content)
-
-    def _harmonics(self, count: int, floats: int) -> DeviceArray:
-        kernel = Kernel.get(self._device, "activate_sh")
-        content = kernel.uniform("Harmonics", gaussians=count, floats=floats, outputs=self._outputs)
-        return self.pool.constant("harmonics", content)
+        return {} if decoding is None else {"biases": decoding.heads.biases, "outputs": decoding.outputs}

@@ -1,4 +1,4 @@
-"""The small layers of a grid field on the device: its weights in one array, and packed as the decoder takes them.
+"""The small layers of a grid field on the device: its weights in one array, and the heads at a time.
 
 The second layer of the Laplacian motion, which only linear layers follow, is folded into the heads at each time; torch
 does the same in motion/fields/grid_field.
@@ -10,237 +10,122 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
+from lapgs_wgpu.gpu.matmul import Matrix
 from lapgs_wgpu.gpu.pool import BufferPool
-from lapgs_wgpu.motion.fields.config import GEOMETRY, FieldConfig
+from lapgs_wgpu.motion.fields.config import APPEARANCE_SCALE, GEOMETRY, FieldConfig, static_grid, temporal_grids
 from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
-from lapgs_wgpu.motion.passes.decoder_passes import DecoderShape, decoder_shape
 
-_NONE = 0xFFFFFFFF  # pack_weights.wgsl
-_ALIGNED = 64  # floats; a multiple of 256 bytes, at which a binding may begin
+ALIGNED = 64  # floats; a multiple of 256 bytes, at which a binding may begin
 _BIASES = 20  # floats of the heads' biases, as activate.wgsl binds them
-_HEADS = sum(GEOMETRY)
-
+# What one product or pass takes lies together.
+_FIRST = [f"{name}.weight" for name in ("spatial", "motion.first", "heads", "appearance")]
+_FIRST += [f"{name}.bias" for name in ("spatial", "motion.first", "temporal", "heads", "appearance")]
+_LAST = "motion.frequencies"  # which has an optimizer of its own
+_SPECTRUM = {"second": "motion.second.weight", "second_bias": "motion.second.bias"} | {
+    name: f"motion.{name}" for name in ("alpha", "beta", "frequencies")
+}
 
 Time = Callable[[], float]  # gives that of the step that is taken, in [0, 1]
 
 
 class Segment(NamedTuple):
-    """A matrix among packed weights: its first number and its shape."""
+    """A parameter among a field's weights: its first number and its shape."""
 
     first: int
     shape: tuple[int, ...]
 
-    def of(self, packed: DeviceArray) -> DeviceArray:
-        """This part of an array of packed weights."""
-        return DeviceArray(packed.buffer, self.shape, packed.dtype, packed.offset + 4 * self.first)
 
+class Heads(NamedTuple):
+    """The heads at a time, or the gradient of them.
 
-class _Packing:
-    """Where packed numbers come from, and times what."""
+    Attributes:
+        weights: (outputs, features) of what the gate leaves and of the motion's inner layer.
+        biases: (20,), of which as many count as there are outputs.
+    """
 
-    def __init__(self) -> None:
-        self.segments: dict[str, Segment] = {}
-        self._parts: list[tuple[NDArray[np.uint32], NDArray[np.float32]]] = []
-        self.count = 0
-
-    def add(self, name: str, sources: NDArray[np.integer], factors: NDArray[np.floating] | float = 1.0) -> None:
-        """A matrix of places among the weights, negative for zeros, and factors that broadcast to its shape."""
-        size = -(-sources.size // _ALIGNED) * _ALIGNED
-        places, scales = np.full(size, _NONE, np.uint32), np.zeros(size, np.float32)
-        places[: sources.size] = np.where(sources < 0, _NONE, sources).reshape(-1)
-        scales[: sources.size] = np.broadcast_to(factors, sources.shape).reshape(-1)
-        self.segments[name] = Segment(self.count, sources.shape)
-        self._parts.append((places, scales))
-        self.count += size
-
-    def upload(self, device: Device, name: str) -> None:
-        places, scales = (np.concatenate(each) for each in zip(*self._parts, strict=True))
-        self.sources = DeviceArray.upload(device, f"{name} sources", places)
-        self.factors = DeviceArray.upload(device, f"{name} factors", scales)
+    weights: DeviceArray
+    biases: DeviceArray
 
 
 class FieldWeights:
-    """Records the passes between a field's weights and the decoder's.
+    """The weights of a field that `decodes_on_device`, and the passes from them to the heads and back.
 
-    places: by name of each parameter but the tables its first number in the array of weights, and its shape. count:
-    numbers of that array, the frequencies last. shape: of the decoder.
+    Attributes:
+        width: channels of a layer.
+        dynamics, static, temporal: columns of the layers' inputs; the first and the last may be 0.
+        outputs: of the heads.
+        motion: whether there is the inner layer of the Laplacian motion.
+        places: by name of each parameter but the tables its place in the array of weights.
+        count: numbers of that array, the frequencies last.
     """
 
     def __init__(self, device: Device, config: FieldConfig) -> None:
-        self.config, self.shape = config, decoder_shape(config)
-        self._device, self._pool = device, BufferPool(device)
-        names = {name: size for name, size in parameter_shapes(config).items() if not name.endswith(".table")}
-        last = "motion.frequencies"
-        ordered = [*(name for name in names if name != last), *([last] if last in names else [])]
+        self.config, self._device, self._pool = config, device, BufferPool(device)
+        self.width, self.dynamics, self.static = config.width, config.dynamics_size, static_grid(config).features
+        self.temporal = sum(grid.features for grid in temporal_grids(config))
+        self.outputs, self.motion = sum(GEOMETRY) + config.appearance_size, config.kind == "laplacian"
+        shapes = {name: shape for name, shape in parameter_shapes(config).items() if not name.endswith(".table")}
+        order = [*_FIRST, *(name for name in shapes if name not in (*_FIRST, _LAST)), _LAST]
         self.places: dict[str, Segment] = {}
         self.count = 0
-        for name in ordered:
-            self.places[name] = Segment(self.count, names[name])
-            self.count += math.prod(names[name])
-        self._layers, self._heads = _Packing(), _Packing()
-        self._pack_layers(self.shape)
-        self._pack_heads(self.shape)
-        self._layers.upload(device, "layers")
-        self._heads.upload(device, "heads")
+        for name in (name for name in order if name in shapes):
+            self.places[name] = Segment(self.count, shapes[name])
+            self.count += math.prod(shapes[name])
 
-    def _of(self, name: str) -> NDArray[np.int64]:
-        first, shape = self.places[name]
-        return np.arange(first, first + math.prod(shape)).reshape(shape)
+    @property
+    def placed(self) -> int:
+        """Number of channels that depend on the static features; the heads read as many."""
+        return self.width * (2 if self.motion else 1)
 
-    def _pack_layers(self, shape: DecoderShape) -> None:
-        size, width = self.config.dynamics_size, shape.width
-        temporal = self._of("temporal.weight")
-        beside = np.full((shape.channels, shape.beside), -1)
-        factors = np.ones((shape.channels, 1))
-        factors[:width] = 0.5
-        static, halves = [self._of("spatial.weight")], [np.full((width, 1), 0.5)]
-        beside[:width, -1] = self._of("spatial.bias")
-        if shape.motion:
-            static.append(self._of("motion.first.weight"))
-            halves.append(np.ones((width, 1)))
-            beside[width : 2 * width, -1] = self._of("motion.first.bias")
-        beside[shape.placed :, :size] = temporal[:, :size]
-        beside[shape.placed :, -1] = self._of("temporal.bias")
-        self._layers.add("beside", beside, factors)
-        self._layers.add("static", np.concatenate(static), np.concatenate(halves))
-        if shape.temporal:
-            self._layers.add("temporal", temporal[:, size:])
+    @property
+    def channels(self) -> int:
+        """Number of channels of all layers: spatial, the motion's inner ones, temporal."""
+        return self.placed + self.width
 
-    def _pack_heads(self, shape: DecoderShape) -> None:
-        weights, biases = [self._of("heads.weight")], [self._of("heads.bias")]
-        if self.config.appearance_size:
-            weights.append(self._of("appearance.weight"))
-            biases.append(self._of("appearance.bias"))
-        heads = np.full((shape.outputs, shape.placed), -1)
-        heads[:, : shape.width] = np.concatenate(weights)
-        padded = np.full((_BIASES, 1), -1)
-        padded[: shape.outputs, 0] = np.concatenate(biases)
-        factors = np.ones((_BIASES, 1))
-        factors[: shape.outputs, 0] = self.config.head_factors
-        self._heads.add("heads", heads, factors[: shape.outputs])
-        self._heads.add("biases", padded, factors)
+    def matrix(self, array: DeviceArray, name: str, rows: int, columns: int) -> Matrix:
+        """A matrix that begins with a parameter, in the array of weights or of their gradients."""
+        return Matrix(array, rows, columns, columns, self.places[name].first)
 
-    def layers(self, name: str) -> DeviceArray:
-        """An array for packed layers, or for their gradients, by name."""
-        return self._pool.array(f"layers {name}", (self._layers.count,))
+    def heads(self, name: str) -> Heads:
+        """Arrays for heads, or for their gradients, by name."""
+        first = -(-self.outputs * self.placed // ALIGNED) * ALIGNED
+        buffer = self._pool.array(f"heads {name}", (first + _BIASES,)).buffer
+        weights = DeviceArray(buffer, (self.outputs, self.placed))
+        return Heads(weights, DeviceArray(buffer, (_BIASES,), offset=4 * first))
 
-    def heads(self, name: str) -> DeviceArray:
-        """An array for packed heads, or for their gradients, by name."""
-        return self._pool.array(f"heads {name}", (self._heads.count,))
+    def heads_at(self, commands: Commands, weights: DeviceArray, name: str, t: Time) -> Heads:
+        """Record the heads at a time. name: distinguishes the times that are submitted together."""
+        arrays = {"spectrum": self._spectrum(name, t), "weights": weights, "series": self._series(name)}
+        if self.motion:
+            commands.dispatch(Kernel.get(self._device, "spectrum"), -(-self.width // 64), **arrays)
+        heads = self.heads(name)
+        arrays |= {"heads": heads.weights, "biases": heads.biases}
+        groups = -(-self.outputs * (self.placed + 1) // 64)
+        commands.run(Kernel.get(self._device, "fold_motion", MOTION=self.motion), groups, arrays)
+        return heads
 
-    def segments(self, layers: DeviceArray, heads: DeviceArray) -> dict[str, DeviceArray]:
-        """The matrices of packed weights by the names of `DecoderShape.weights`, and the heads' "biases"."""
-        of_layers = {name: segment.of(layers) for name, segment in self._layers.segments.items()}
-        return of_layers | {name: segment.of(heads) for name, segment in self._heads.segments.items()}
-
-    def gradient_segments(self, layers: DeviceArray, heads: DeviceArray) -> dict[str, DeviceArray]:
-        """The same of gradients, as `DecoderPasses.decode_bwd` writes them: biases (outputs, 1)."""
-        found = self.segments(layers, heads)
-        biases = found["biases"]
-        return found | {"biases": DeviceArray(biases.buffer, (self.shape.outputs, 1), "float32", biases.offset)}
-
-    # Passes ----------------------------------------------------------------------------------------------------------
-
-    def pack_layers(self, commands: Commands, weights: DeviceArray) -> DeviceArray:
-        """Record the packing of the layers; the packed ones."""
-        packed = self.layers("packed")
-        self._pack(commands, self._layers, weights, packed)
-        return packed
-
-    def unpack_layers(self, commands: Commands, d_weights: DeviceArray, d_packed: DeviceArray) -> None:
-        """Record that the gradients of packed layers are added to those of the weights."""
-        self._pack(commands, self._layers, d_weights, d_packed, back=True)
-
-    def pack_heads(self, commands: Commands, weights: DeviceArray, name: str, t: Time) -> DeviceArray:
-        """Record the packing of the heads at a time, with the motion folded in; the packed ones.
-
-        name: distinguishes the times that are submitted together.
-        """
-        packed = self.heads(name)
-        self._pack(commands, self._heads, weights, packed)
-        if self.shape.motion:
-            series = self._pool.array(f"series {name}", (self.config.width,))
-            spectrum = commands.varying(lambda: self._spectrum(name, t()))
-            commands.dispatch(
-                Kernel.get(self._device, "spectrum"),
-                -(-self.config.width // 64),
-                spectrum=spectrum,
-                weights=weights,
-                series=series,
-            )
-            both = {name: segment.of(packed) for name, segment in self._heads.segments.items()}
-            commands.dispatch(
-                Kernel.get(self._device, "fold_motion"),
-                -(-_HEADS * (self.config.width + 1) // 64),
-                spectrum=spectrum,
-                weights=weights,
-                series=series,
-                **both,
-            )
-        return packed
-
-    def unpack_heads(
-        self,
-        commands: Commands,
-        weights: DeviceArray,
-        d_weights: DeviceArray,
-        d_packed: DeviceArray,
-        name: str,
-        t: Time,
+    def heads_bwd(
+        self, commands: Commands, weights: DeviceArray, d_weights: DeviceArray, d_heads: Heads, name: str, t: Time
     ) -> None:
-        """Record that the gradients of heads that `pack_heads` packed are added to those of the weights."""
-        self._pack(commands, self._heads, d_weights, d_packed, back=True)
-        if not self.shape.motion:
-            return
-        series = self._pool.array(f"series {name}", (self.config.width,))
-        d_series = self._pool.array("d_series", (self.config.width,))
-        arrays = {"spectrum": self._spectrum(name, t()), "weights": weights, "d_weights": d_weights}
-        both = {f"d_{name}": segment.of(d_packed) for name, segment in self._heads.segments.items()}
-        fold = Kernel.get(self._device, "fold_motion_bwd")
-        commands.dispatch(fold, self.config.width, **arrays, series=series, d_series=d_series, **both)
-        back = Kernel.get(self._device, "spectrum_bwd")
-        commands.dispatch(back, self.config.components, **arrays, d_series=d_series)
+        """Record that the gradients of heads that `heads_at` gave are added to those of the weights."""
+        arrays = {"spectrum": self._spectrum(name, t), "weights": weights, "d_weights": d_weights}
+        arrays |= {"series": self._series(name), "d_series": self._series("gradient")}
+        arrays |= {"d_heads": d_heads.weights, "d_biases": d_heads.biases}
+        fold = Kernel.get(self._device, "fold_motion_bwd", MOTION=self.motion)
+        commands.run(fold, self.width, arrays)
+        if self.motion:
+            commands.run(Kernel.get(self._device, "spectrum_bwd"), self.config.components, arrays)
 
-    def _spectrum(self, name: str, t: float) -> DeviceArray:
-        place = {key: self.places[of].first for key, of in _SPECTRUM.items()}
-        content = Kernel.get(self._device, "spectrum").uniform(
-            "Spectrum",
-            width=self.config.width,
-            components=self.config.components,
-            columns=self.shape.placed,
-            time=t,
-            unit=self.config.unit,
-            **place,
-        )
-        return self._pool.constant(f"spectrum {name}", content)
+    def _series(self, name: str) -> DeviceArray:
+        return self._pool.array(f"series {name}", (self.width,))
 
-    def _pack(
-        self, commands: Commands, packing: _Packing, weights: DeviceArray, packed: DeviceArray, *, back: bool = False
-    ) -> None:
-        kernel = Kernel.get(self._device, "pack_weights", BACK=back)
-        content = kernel.uniform("Packing", count=packing.count)
-        commands.dispatch(
-            kernel,
-            -(-packing.count // 64),
-            packing=self._pool.constant(f"packing {packing.count}", content),
-            sources=packing.sources,
-            factors=packing.factors,
-            weights=weights,
-            packed=packed,
-        )
-
-
-_SPECTRUM = {
-    "alpha": "motion.alpha",
-    "beta": "motion.beta",
-    "frequencies": "motion.frequencies",
-    "second": "motion.second.weight",
-    "second_bias": "motion.second.bias",
-    "heads": "heads.weight",
-}
+    def _spectrum(self, name: str, t: Time) -> DeviceArray:
+        kernel, of = Kernel.get(self._device, "spectrum"), self.places
+        given = {key: of[parameter].first if parameter in of else 0 for key, parameter in _SPECTRUM.items()}
+        given |= {"width": self.width, "components": self.config.components, "columns": self.placed}
+        given |= {"outputs": self.outputs, "heads": of["heads.weight"].first, "head_biases": of["heads.bias"].first}
+        factors = {"unit": self.config.unit, "appearance": APPEARANCE_SCALE}
+        return self._pool.varying(f"spectrum {name}", lambda: kernel.uniform("Spectrum", time=t(), **factors, **given))

@@ -6,7 +6,6 @@ Everything stays in device arrays. Gradients are added to arrays that the caller
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
 from lapgs_wgpu.gpu.array import DeviceArray
@@ -15,7 +14,7 @@ from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.config import FieldConfig, static_grid, temporal_grids
 from lapgs_wgpu.motion.passes.decoder_passes import DecoderPasses
-from lapgs_wgpu.motion.passes.field_weights import FieldWeights, Time
+from lapgs_wgpu.motion.passes.field_weights import FieldWeights, Heads, Time
 from lapgs_wgpu.motion.passes.hash_encoder_passes import HashEncoderPasses, PointSet
 from lapgs_wgpu.motion.passes.samples import SamplePasses, Samples, Sampling
 
@@ -45,8 +44,7 @@ class Decoding(NamedTuple):
         sampling: gives those of the Gaussians; None for all, in their order.
         points: of the encoder.
         inputs: of the decoder.
-        weights: packed, of the decoder.
-        heads: the packed array that the weights of the heads are in.
+        heads: at that time.
         outputs: (count, outputs) of the heads, without their biases; before `backward` they become their gradient.
     """
 
@@ -55,14 +53,8 @@ class Decoding(NamedTuple):
     sampling: Sampling | None
     points: PointSet
     inputs: dict[str, DeviceArray]
-    weights: dict[str, DeviceArray]
-    heads: DeviceArray
+    heads: Heads
     outputs: DeviceArray
-
-    @property
-    def biases(self) -> DeviceArray:
-        """Of the heads, as activate.wgsl binds them."""
-        return self.weights["biases"]
 
 
 class Comparison(NamedTuple):
@@ -75,28 +67,31 @@ class Comparison(NamedTuple):
     sums: list[DeviceArray]
 
 
+class _Group(NamedTuple):
+    """Grids that are encoded together. tables: theirs among all; features: of a point."""
+
+    encoder: HashEncoderPasses
+    tables: slice
+    features: int
+
+
 class GridFieldPasses:
     """Records the passes of a field that `decodes_on_device`."""
 
     def __init__(self, device: Device, config: FieldConfig) -> None:
         self.config = config
         self.weights = FieldWeights(device, config)
-        self.shape = self.weights.shape
         self.pool = BufferPool(device)
         self.samples = SamplePasses(device, self.pool)
-        grids = [[static_grid(config)], temporal_grids(config)]
-        self._encoders = [HashEncoderPasses(device, group, config.bound) for group in grids if group]
-        self._grids = [len(group) for group in grids if group]
-        self._features = [sum(grid.features for grid in group) for group in grids if group]
-        self._now, self._sampled = (DecoderPasses(device, self.shape) for _ in range(2))
+        static, temporal = static_grid(config), temporal_grids(config)
+        self._groups = [_Group(HashEncoderPasses(device, [static], config.bound), slice(1), static.features)]
+        if temporal:
+            encoder = HashEncoderPasses(device, temporal, config.bound)
+            self._groups.append(_Group(encoder, slice(1, None), self.weights.temporal))
+        self._decoder = DecoderPasses(device, self.weights)
         self._device = device
-        self._layers: DeviceArray | None = None
 
     # Forward ---------------------------------------------------------------------------------------------------------
-
-    def begin(self, commands: Commands, arrays: FieldArrays) -> None:
-        """Record what all times of a step share, before the first `decode`."""
-        self._layers = self.weights.pack_layers(commands, arrays.weights)
 
     def decode(
         self, commands: Commands, number: int, arrays: FieldArrays, t: Time, sampling: Sampling | None = None
@@ -105,22 +100,18 @@ class GridFieldPasses:
 
         number: distinguishes the times that are submitted together, from 0 on.
         """
-        assert self._layers is not None
-        name, every = f"decoded {number}", sampling is None
-        count = arrays.geometry.shape[0]
-        chosen = sampling or partial(Samples, count, count)
-        points = self._points(commands, number, chosen, arrays, t, every=every)
+        name = f"decoded {number}"
+        points = self._points(commands, number, sampling, arrays, t)
         encodings = self._encode(commands, points, arrays.tables)
         beside = arrays.beside
         if sampling is not None:
             beside = self.pool.array(f"beside {number}", (points.count, beside.shape[1]))
             self.samples.rows(commands, f"set {number}", sampling, arrays.beside, beside, back=False)
-        heads = self.weights.pack_heads(commands, arrays.weights, name, t)
-        weights = self.weights.segments(self._layers, heads)
-        inputs = dict(zip(self.shape.inputs, [beside, *encodings], strict=True))
-        outputs = self.pool.array(f"outputs {number}", (points.count, self.shape.outputs))
-        self._decoder(sampling).decode(commands, inputs, weights, outputs)
-        return Decoding(name, t, sampling, points, inputs, weights, heads, outputs)
+        heads = self.weights.heads_at(commands, arrays.weights, name, t)
+        inputs = dict(zip(("beside", "static", "temporal"), [beside, *encodings], strict=False))
+        outputs = self.pool.array(f"outputs {number}", (points.count, self.weights.outputs))
+        self._decoder.decode(commands, inputs, arrays.weights, heads, outputs)
+        return Decoding(name, t, sampling, points, inputs, heads, outputs)
 
     def compare(
         self, commands: Commands, number: int, arrays: FieldArrays, t: Time, near: Sampling, near_time: Time
@@ -150,35 +141,24 @@ class GridFieldPasses:
 
     # Backward --------------------------------------------------------------------------------------------------------
 
-    def decode_bwd(
-        self, commands: Commands, decoding: Decoding, arrays: FieldArrays, gradients: FieldArrays, *, first: bool
-    ) -> None:
+    def decode_bwd(self, commands: Commands, decoding: Decoding, arrays: FieldArrays, gradients: FieldArrays) -> None:
         """Record the backward pass, from the outputs, which have become their gradient.
 
-        The gradient of `beside` is written for all Gaussians, and added for samples. first: whether it is the first
-        such call of a step.
+        The gradient of `beside` is written for all Gaussians, and added for samples.
         """
         d_beside = gradients.beside
         if decoding.sampling is not None:
             d_beside = self.pool.array("d_beside", decoding.inputs["beside"].shape)
-        d_layers, d_heads = self.weights.layers("gradient"), self.weights.heads("gradient")
-        d_weights = self.weights.gradient_segments(d_layers, d_heads)
-        self._decoder(decoding.sampling).decode_bwd(
-            commands,
-            decoding.inputs,
-            decoding.weights,
-            decoding.outputs,
-            decoding.inputs | {"beside": d_beside},
-            d_weights,
-            add=not first,
-        )
+        d_heads = self.weights.heads("gradient")
+        inputs, d_weights = decoding.inputs, gradients.weights
+        given = inputs, arrays.weights, decoding.heads, decoding.outputs
+        self._decoder.decode_bwd(commands, *given, inputs | {"beside": d_beside}, d_weights, d_heads)
         if decoding.sampling is not None:
             number = decoding.points.number
             self.samples.rows(commands, f"set {number}", decoding.sampling, gradients.beside, d_beside, back=True)
-        encodings = [decoding.inputs[name] for name in self.shape.inputs if name != "beside"]
+        encodings = [array for name, array in inputs.items() if name != "beside"]
         self._encode_bwd(commands, decoding.points, encodings, gradients.tables)
-        place = arrays.weights, gradients.weights, d_heads, decoding.name, decoding.time
-        self.weights.unpack_heads(commands, *place)
+        self.weights.heads_bwd(commands, arrays.weights, d_weights, d_heads, decoding.name, decoding.time)
 
     def compare_bwd(
         self, commands: Commands, comparison: Comparison, gradients: FieldArrays, weights: list[float]
@@ -188,52 +168,34 @@ class GridFieldPasses:
         kernel = Kernel.get(self._device, "smoothness_bwd")
         for group, (here, there) in enumerate(zip(comparison.here, comparison.there, strict=True)):
             uniform = self._smoothness(group, count, 2 * weights[group])
-            groups = -(-count * self._features[group] // 64)
+            groups = -(-count * self._groups[group].features // 64)
             commands.dispatch(kernel, groups, smoothness=uniform, here=here, there=there)
         for points, encodings in zip(comparison.points, (comparison.here, comparison.there), strict=True):
             self._encode_bwd(commands, points, encodings, gradients.tables)
 
-    def end(self, commands: Commands, gradients: FieldArrays) -> None:
-        """Record what all times of a step share, after the last `decode_bwd`."""
-        self.weights.unpack_layers(commands, gradients.weights, self.weights.layers("gradient"))
-
     # Parts -----------------------------------------------------------------------------------------------------------
 
-    def _decoder(self, sampling: Sampling | None) -> DecoderPasses:
-        """Of all Gaussians, or of samples: sets of equal size share one, and with it its buffers."""
-        return self._now if sampling is None else self._sampled
-
     def _points(
-        self,
-        commands: Commands,
-        number: int,
-        sampling: Sampling,
-        arrays: FieldArrays,
-        t: Time,
-        *,
-        every: bool = False,
+        self, commands: Commands, number: int, sampling: Sampling | None, arrays: FieldArrays, t: Time
     ) -> PointSet:
-        array = self.samples.places(commands, f"set {number}", sampling, arrays.geometry, every=every)
+        array = self.samples.places(commands, f"set {number}", sampling, arrays.geometry)
         return PointSet(number, array, array.shape[0], lambda: self.config.grid_time(t()))
 
     def _encode(self, commands: Commands, points: PointSet, tables: list[DeviceArray]) -> list[DeviceArray]:
-        found, rest = [], list(tables)
-        for group, (encoder, grids) in enumerate(zip(self._encoders, self._grids, strict=True)):
-            encoding = self.pool.array(f"encoding {points.number} {group}", (points.count, self._features[group]))
-            encoder.encode(commands, points, rest[:grids], encoding)
-            rest = rest[grids:]
+        found = []
+        for number, (encoder, own, features) in enumerate(self._groups):
+            encoding = self.pool.array(f"encoding {points.number} {number}", (points.count, features))
+            encoder.encode(commands, points, tables[own], encoding)
             found.append(encoding)
         return found
 
     def _encode_bwd(
         self, commands: Commands, points: PointSet, d_encodings: list[DeviceArray], d_tables: list[DeviceArray]
     ) -> None:
-        rest = list(d_tables)
-        for encoder, grids, d_encoding in zip(self._encoders, self._grids, d_encodings, strict=True):
-            encoder.add_gradient(commands, points, d_encoding, rest[:grids])
-            rest = rest[grids:]
+        for (encoder, own, _), d_encoding in zip(self._groups, d_encodings, strict=True):
+            encoder.add_gradient(commands, points, d_encoding, d_tables[own])
 
     def _smoothness(self, group: int, pairs: int, scale: float) -> DeviceArray:
         kernel = Kernel.get(self._device, "smoothness")
-        content = kernel.uniform("Smoothness", pairs=pairs, features=self._features[group], scale=scale)
-        return self.pool.constant(f"smoothness {group} {'back' if scale else 'forth'}", content)
+        content = kernel.uniform("Smoothness", pairs=pairs, features=self._groups[group].features, scale=scale)
+        return self.pool.constant(content)

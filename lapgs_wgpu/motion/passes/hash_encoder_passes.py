@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,18 +111,14 @@ class HashEncoderPasses:
     def _uniform(self, points: PointSet, first: int, count: int, most: int) -> DeviceArray:
         """Return the uniform of a block of points, of at most so many (0: of all). All blocks of all sets are submitted
         together, so each has its own."""
-        content = Kernel.get(self.device, "hashgrid_slice").uniform(
-            "Grid",
-            points=count,
-            all_points=points.count,
-            all_levels=self._row // 2,
-            time=points.time() if self._timed else 0.0,
-            bound=self.bound,
-        )
-        return self.pool.constant(f"grid {points.number} from {first} by {most}", content)
+        kernel, name = Kernel.get(self.device, "hashgrid_slice"), f"grid {points.number} from {first} by {most}"
+        sizes = {"points": count, "all_points": points.count, "all_levels": self._row // 2}
+        if not self._timed:
+            return self.pool.constant(kernel.uniform("Grid", time=0.0, bound=self.bound, **sizes))
+        return self.pool.varying(name, lambda: kernel.uniform("Grid", time=points.time(), bound=self.bound, **sizes))
 
     def _blocks(
-        self, commands: Commands, points: PointSet, encoding: DeviceArray, most: int | None = None
+        self, points: PointSet, encoding: DeviceArray, most: int | None = None
     ) -> Iterator[tuple[int, int, DeviceArray]]:
         """Yield first point, number of points and uniform of each dispatch: at most `most` points, whose rows fit in a
         binding."""
@@ -133,15 +128,14 @@ class HashEncoderPasses:
         size = size if most is None else min(size, most)
         counts = ((first, min(size, n - first)) for first in range(0, n, size))
         for first, count in counts:
-            write = partial(self._uniform, points, first, count, size)
-            yield first, count, commands.varying(write) if self._timed else write()
+            yield first, count, self._uniform(points, first, count, size)
 
     def encode(self, commands: Commands, points: PointSet, tables: list[DeviceArray], encoding: DeviceArray) -> None:
         """Encode points; outside the box [-bound, bound]^3 features are zero.
 
         tables: (entries, 2) of each grid. encoding: (N, row) float32, N = points.count.
         """
-        blocks = list(self._blocks(commands, points, encoding))
+        blocks = list(self._blocks(points, encoding))
         slices = self.pool.array("slices", (self._slice_entries, 2))
         for number, cut in self._cuts.items():
             kernel = Kernel.get(self.device, "hashgrid_slice", **self._long_lanes)
@@ -168,7 +162,7 @@ class HashEncoderPasses:
             ]
 
         largest = {} if self.lane_levels else {"largest": self._largest(commands, points, d_encoding)}
-        for first, count, grid in self._blocks(commands, points, d_encoding, self._most_points):
+        for first, count, grid in self._blocks(points, d_encoding, self._most_points):
             arrays = {"points": points.array.rows(first, count), "d_encoding": d_encoding.rows(first, count)}
             arrays |= {"grid": grid, **largest}
             for levels, target in sums:
@@ -192,7 +186,7 @@ class HashEncoderPasses:
         largest = self.pool.array(f"largest {points.number}", (1,), "uint32")
         commands.clear(largest)
         kernel = Kernel.get(self.device, "hashgrid_largest")
-        for first, count, grid in self._blocks(commands, points, d_encoding):
+        for first, count, grid in self._blocks(points, d_encoding):
             gradient = d_encoding.rows(first, count)
             commands.dispatch(kernel, -(-count * self._row // 4096), grid=grid, d_encoding=gradient, largest=largest)
         return largest

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
@@ -41,17 +42,17 @@ class SamplePasses:
     def __init__(self, device: Device, pool: BufferPool) -> None:
         self._device, self._pool = device, pool
 
-    def places(
-        self, commands: Commands, name: str, sampling: Sampling, geometry: DeviceArray, *, every: bool = False
-    ) -> DeviceArray:
-        """Points (count, 4) at the sampled Gaussians' means, with offsets where they have a reach.
+    def places(self, commands: Commands, name: str, sampling: Sampling | None, geometry: DeviceArray) -> DeviceArray:
+        """Points (count, 4) at the sampled Gaussians' means, with offsets where they have a reach; None: at all means.
 
-        geometry: (N, 12), as common/geometry.wgsl has it. every: take all Gaussians, in their order.
+        geometry: (N, 12), as common/geometry.wgsl has it.
         """
+        every, n = sampling is None, geometry.shape[0]
+        sampling = sampling or partial(Samples, n, n)
         samples = sampling()
         points = self._pool.array(f"points {name}", (samples.count, 4))
         kernel = Kernel.get(self._device, "place_points", SAMPLED=not every, OFFSET=samples.reach > 0)
-        uniform = self.constant(commands, name, sampling)
+        uniform = self.uniform(name, sampling)
         groups = -(-samples.count // 64)
         commands.dispatch(kernel, groups, samples=uniform, geometry=geometry, points=points)
         return points
@@ -65,13 +66,13 @@ class SamplePasses:
         commands.dispatch(
             kernel,
             -(-chosen.size // 64),
-            samples=self.constant(commands, name, sampling),
-            row=self._pool.constant(f"row {columns}", kernel.uniform("Row", columns=columns)),
+            samples=self.uniform(name, sampling),
+            row=self._pool.constant(kernel.uniform("Row", columns=columns)),
             chosen=chosen,
             all=every,
         )
 
-    def constant(self, commands: Commands, name: str, sampling: Sampling) -> DeviceArray:
+    def uniform(self, name: str, sampling: Sampling) -> DeviceArray:
         """The uniform of the samples."""
         kernel = Kernel.get(self._device, "place_points")
-        return commands.varying(lambda: self._pool.constant(f"samples {name}", sampling().uniform(kernel)))
+        return self._pool.varying(f"samples {name}", lambda: sampling().uniform(kernel))

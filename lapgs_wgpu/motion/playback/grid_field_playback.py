@@ -199,7 +199,6 @@ class GridFieldPlayback:
                 points = PointSet(number, block.points, block.count, partial(self._config.grid_time, t))
                 self._temporal.encode(commands, points, self._tables, block.moving)
                 uniform = self._pool.constant(
-                    f"deform {number}",
                     kernel.uniform(
                         "Deform",
                         gaussians=block.count,

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import wgpu
 
+from lapgs_wgpu.gpu import native
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 
 
 class Profile:
-    """Measures each dispatch of the `Commands` that it is passed to.
+    """Measures each dispatch that is submitted while it is `running`; each then gets a compute pass of its own.
 
     capacity: maximum number of dispatches between two calls of `read`. Raises RuntimeError if the device has no
     timestamps.
@@ -31,20 +35,28 @@ class Profile:
         self._ticks = DeviceArray.empty(device, "timestamps to read", (capacity, 2), "uint64")
         self._tick_nanoseconds = _timestamp_period(device)
 
-    def record(self, name: str) -> dict[str, Any]:
-        """Return wgpu's `timestamp_writes` for a compute pass of this name."""
-        first = 2 * len(self._names)
-        if len(self._names) == self.capacity:
-            raise RuntimeError(f"a Profile of {self.capacity} dispatches is full: read() it earlier, or make it larger")
-        self._names.append(name)
-        return {
-            "query_set": self._queries,
-            "beginning_of_pass_write_index": first,
-            "end_of_pass_write_index": first + 1,
-        }
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """What is submitted within is measured."""
+        with mock.patch.object(native, "play", self._play):
+            yield
 
-    def resolve(self, encoder: Any) -> None:
-        """Record the copy of all timestamps to the array that `read` reads."""
+    def _play(self, encoder: Any, commands: list[native.Command], play: Any = native.play) -> None:
+        for command in commands:
+            if command[0] != "dispatch":
+                play(encoder, [command])
+                continue
+            kernel, group, columns, rows = command[1:]
+            first = 2 * len(self._names)
+            if len(self._names) == self.capacity:
+                raise RuntimeError(f"a Profile of {self.capacity} dispatches is full: read() it earlier, or enlarge it")
+            self._names.append(kernel.name)
+            writes = {"beginning_of_pass_write_index": first, "end_of_pass_write_index": first + 1}
+            timed = encoder.begin_compute_pass(timestamp_writes={"query_set": self._queries, **writes})
+            timed.set_pipeline(kernel.pipeline)
+            timed.set_bind_group(0, group.wgpu)
+            timed.dispatch_workgroups(columns, rows)
+            timed.end()
         count = 2 * len(self._names)
         if count:
             encoder.resolve_query_set(self._queries, 0, count, self._resolved, 0)
