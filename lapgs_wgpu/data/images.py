@@ -48,7 +48,7 @@ class ImageFile(NamedTuple):
 
     size: (width, height) in pixels. orientation: as EXIF states it, 1 to 8; 1 is upright. deep: whether it has 16 bits
     per channel, of which the upper 8 are read. alpha: whether it states opacities. upright: whether `read` turns it as
-    `orientation` says.
+    `orientation` says. source: where it comes from if not from a file of the capture, for errors.
     """
 
     path: Path
@@ -57,9 +57,10 @@ class ImageFile(NamedTuple):
     deep: bool = False
     alpha: bool = False
     upright: bool = False
+    source: str = ""
 
     def __str__(self) -> str:
-        return str(self.path)
+        return self.source or str(self.path)
 
     def read(self, size: Size) -> Pixels:
         """Decode the image and shrink it to (width, height): see `decode`. Raises InputError."""

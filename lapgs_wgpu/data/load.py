@@ -294,6 +294,6 @@ def _by_film(shots: Sequence[_Shot], warnings: list[str]) -> list[_Shot]:
     ordered = []
     for mine in by_camera([shot.frame.name for shot in shots]).values():
         film = sorted((shots[i] for i in mine), key=lambda shot: (shot.frame.time, natural_key(shot.frame.name.file)))
-        warnings += check_film([Path(str(shot.frame.image)) for shot in film])
+        warnings += check_film([shot.frame.image.path for shot in film])
         ordered += film
     return ordered

@@ -46,7 +46,7 @@ def upright(frames: Sequence[Frame]) -> tuple[list[Frame], list[str]]:
     turned, unclear = [], []
     for frame in frames:
         image = frame.image
-        if isinstance(image, ImageFile) and image.orientation > 1:
+        if image.orientation > 1:
             stored, shown = (_fits(size, frame.lens) for size in (image.size, image.turned.size))
             if shown and not stored:
                 frame = dataclasses.replace(frame, image=image.turned)
@@ -74,7 +74,7 @@ def check_plausible(frames: Sequence[Frame]) -> list[str]:
             f"{lens.width}x{lens.height}, in {len(off)} cameras; unless the images were cut out of larger ones, the "
             "intrinsics are those of another size, or in other units than pixels."
         )
-    images = [frame.image for frame in frames if isinstance(frame.image, ImageFile)]
+    images = [frame.image for frame in frames]
     deep, transparent = [image for image in images if image.deep], [image for image in images if image.alpha]
     if told := _low_levels(deep, slice(3), "images of 16 bits are nearly black", "level"):
         text, highest = told
