@@ -189,16 +189,11 @@ def _export(given: Any, scene: LoadedScene) -> None:
     print(f"{file}: {line}{size}, {loss.psnr:.1f} dB PSNR against {scene.path}")
     if loss.reason:
         print(f"warning: the loss is seen: {loss.reason}.", file=sys.stderr)
-    # Our own formats say whether the scene is antialiased, and all programs that play them know it.
-    if ending not in (".lapgs", ".html") and scene.playback.at(0.0).antialiased:
-        says = (
-            "no player reads from this format"
-            if ending in (".4dgs", *USD)
-            else "its comment 'SplatRenderMode: mip' tells few viewers"
-        )
+    # Our own formats say whether the scene is antialiased; for .4dgs and OpenUSD opacities are fitted to plain drawing.
+    if ending in (".ply", "") and scene.playback.at(0.0).antialiased:
         print(
-            f"note: the scene was trained antialiased, which {says}: where they offer antialiased drawing, turn it on; "
-            "elsewhere thin places look a little thicker.",
+            "note: the scene was trained antialiased, which the comment 'SplatRenderMode: mip' tells few viewers: "
+            "where they offer antialiased drawing, turn it on; elsewhere thin places look a little thicker.",
             file=sys.stderr,
         )
 
