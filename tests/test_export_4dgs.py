@@ -108,7 +108,7 @@ def test_what_was_trained_antialiased_is_fitted_to_plain_drawing(device: Device,
     assert export_4dgs(scene, tmp_path / "a.4dgs", 0.5).psnr > thick + 4
     factors = plain_factors(scene)
     assert factors.shape == (COUNT,)
-    assert 0.05 < factors.min() < factors.max() < 0.9
+    assert 0 < np.median(factors) < 0.5
     assert (plain_factors(plain) == 1).all()
 
 
