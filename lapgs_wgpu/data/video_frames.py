@@ -8,9 +8,7 @@ again.
 from __future__ import annotations
 
 import os
-import shutil
 import sys
-import tempfile
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
@@ -20,7 +18,7 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.data.images import LANCZOS, ImageFile, Pixels, Size, encode_png, resize, shrunk_size, size_text
 from lapgs_wgpu.errors import InputError, pip_install
-from lapgs_wgpu.io.atomic import move
+from lapgs_wgpu.io.atomic import new_folder
 
 # Flags of swscale: bicubic, accurate rounding, chroma interpolated along rows. Its default darkens by 1 or 2 levels.
 EXACT_COLORS = 0x4 | 0x40000 | 0x2000
@@ -91,15 +89,14 @@ def _check_header(path: Path) -> tuple[Display, Size]:
 
 
 def _unpack(path: Path, folder: Path, shape: Display, size: Size, wanted: Size) -> None:
-    """Write every frame, of (width, height) `size`, as PNG of the wanted size into a new folder, atomically."""
+    """Write every frame, of (width, height) `size`, as PNG of the wanted size into a new folder. Raises InputError."""
     av = import_av(path)
     print(f"{path}: its frames are unpacked once, into {folder}", file=sys.stderr, flush=True)
-    unfinished, declared = None, 0
-    written: list[Future[None]] = []
+    written, declared = list[Future[None]](), 0
+    room = f"{wanted[0] * wanted[1] * 1.5e-6:.1f} MB a frame"
     try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = Path(tempfile.mkdtemp(suffix=".partial", dir=folder.parent))
         with (
+            new_folder(folder, f"make room there, {room}, or set XDG_CACHE_HOME to another folder") as unfinished,
             ThreadPoolExecutor(WRITERS, thread_name_prefix="unpack") as pool,
             av.open(str(path), metadata_errors="replace") as file,
         ):
@@ -120,20 +117,10 @@ def _unpack(path: Path, folder: Path, shape: Display, size: Size, wanted: Size) 
                     written.append(pool.submit(_write, image, wanted, unfinished / f"{len(written):05d}.png"))
             for pending in written:
                 pending.result()
-        if len(written) != declared:
-            raise InputError(f"{path} has {declared} frames, and {len(written)} can be decoded; copy it again.")
-        move(unfinished, folder)
+            if len(written) != declared:
+                raise InputError(f"{path} has {declared} frames, and {len(written)} can be decoded; copy it again.")
     except av.error.FFmpegError as error:
         raise InputError(f"{path} cannot be decoded ({error}); copy or record it again.") from None
-    except OSError as error:
-        if not folder.is_dir():  # otherwise another process was faster
-            raise InputError(
-                f"{folder} cannot be written ({error.strerror or error}); make room there, or set XDG_CACHE_HOME "
-                f"to a folder with room for about {wanted[0] * wanted[1] * 1.5e-6:.1f} MB a frame."
-            ) from None
-    finally:
-        if unfinished is not None:
-            shutil.rmtree(unfinished, ignore_errors=True)
 
 
 class Display(NamedTuple):

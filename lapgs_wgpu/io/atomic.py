@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import secrets
+import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -44,6 +45,27 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         _remove(temporary)
         raise
     _sync_folder(path)
+
+
+@contextmanager
+def new_folder(folder: Path, advice: str = "make room there, or name another") -> Iterator[Path]:
+    """A folder to fill, which takes the name `folder` when the block ends without an exception.
+
+    `folder` must not exist, or be empty; where another process made it meanwhile, that one stays. Raises InputError,
+    which ends with the advice, on errors of the file system.
+    """
+    unfinished = folder.with_name(f"{folder.name}.{secrets.token_hex(4)}.partial")
+    try:
+        unfinished.mkdir(parents=True)
+        yield unfinished
+        with suppress(OSError):
+            folder.rmdir()  # it is empty
+        if not folder.exists():
+            move(unfinished, folder)
+    except OSError as error:
+        raise InputError(f"{folder} cannot be written ({error.strerror or error}); {advice}.") from None
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
 
 
 def move(source: Path, target: Path) -> None:
