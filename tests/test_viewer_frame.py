@@ -27,7 +27,7 @@ from lapgs_wgpu.viewer.frame import Frame, FrameRenderer, FrameRequest
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 from lapgs_wgpu.viewer.options import parse_options
 from lapgs_wgpu.viewer.render_modes import Mode
-from lapgs_wgpu.viewer.training_control import TrainingControl
+from lapgs_wgpu.viewer.view_state import TrainingControl
 
 pytestmark = pytest.mark.kernels
 

@@ -21,7 +21,7 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.viewer import window
 from lapgs_wgpu.viewer.app import App
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
-from lapgs_wgpu.viewer.training_control import TrainingControl, TrainingStep
+from lapgs_wgpu.viewer.view_state import TrainingControl, TrainingStep
 
 SHARE = 0.02  # of the time may go into pictures while nobody moves anything
 _OPENING = 4.0  # seconds after the first step, in which the window draws what it begins with: shaders are compiled

@@ -18,10 +18,10 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from lapgs_wgpu.errors import InputError, pip_install
-from lapgs_wgpu.viewer.gui_library import check_imgui
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 from lapgs_wgpu.viewer.view_state import ViewState
 from lapgs_wgpu.viewer.web_page import web_file
+from lapgs_wgpu.viewer.window import check_imgui
 
 Message = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[Message]]

@@ -3,17 +3,45 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from lapgs_wgpu.viewer.capture_views import capture_views
 from lapgs_wgpu.viewer.clock import LOOPS, SPEEDS
 from lapgs_wgpu.viewer.frame import FrameRenderer
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 from lapgs_wgpu.viewer.render_modes import BACKGROUNDS, Mode
-from lapgs_wgpu.viewer.training_control import TrainingControl
 
 if TYPE_CHECKING:
     from lapgs_wgpu.data import View
+
+
+class TrainingStep(Protocol):
+    """A finished step: its number, the total number of steps, and the PSNR in dB of its view."""
+
+    @property
+    def step(self) -> int: ...
+    @property
+    def steps(self) -> int: ...
+    @property
+    def psnr(self) -> float: ...
+
+
+class TrainingControl:
+    """Pauses a training. last: the last finished step. single: steps that still run although the training is paused."""
+
+    def __init__(self) -> None:
+        self.last: TrainingStep | None = None
+        self.paused = False
+        self.single = 0
+
+    def toggle_pause(self) -> None:
+        """Pause or continue."""
+        self.paused = not self.paused
+
+    def step(self) -> None:
+        """Run one step, then pause."""
+        self.paused = True
+        self.single += 1
 
 
 class ViewState:
