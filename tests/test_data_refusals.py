@@ -154,11 +154,11 @@ def packed(file: str, at: int, number: int) -> Damage:
 
 
 BINARY: list[Case] = [
-    *((packed(f"{MODEL}/{name}.bin", 0, count), f"{name}.bin {count}")
+    *((packed(f"{MODEL}/{name}.bin", 0, count), f"{name}.bin")
       for name in ("cameras", "images", "points3D") for count in (1000, 2**64 - 1)),
     (packed(f"{MODEL}/points3D.bin", COUNT_OF_POINT, 2**61), "points3D.bin"),
     (replaced(f"{MODEL}/images.bin", b".png\0" + struct.pack("<Q", 2), b".png\0" + struct.pack("<Q", 2**61)),
-     "images.bin frame_0001.png"),
+     "images.bin"),
     (text(f"{MODEL}/images.bin", struct.pack("<QI7dI", 1, 1, 1, *6 * [0.0], 7) + 200 * b"a"), "images.bin"),
     (text(f"{MODEL}/cameras.bin", struct.pack("<QIiQQ8d", 1, 7, 5, WIDTH, HEIGHT, *8 * [1.0])),
      "cameras.bin OPENCV_FISHEYE"),

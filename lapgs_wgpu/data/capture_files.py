@@ -66,9 +66,9 @@ class CaptureFiles:
         """
         suffixes = ("",) if name.lower().endswith(SUFFIXES) else SUFFIXES
         found = next((found for suffix in suffixes if (found := self.find(name + suffix))), None)
-        if found is None and os.path.isfile(self.folder / name):
-            check_image(self.folder / name)  # says what it is
         if found is None:
+            if os.path.isfile(self.folder / name):
+                check_image(self.folder / name)  # says what it is
             self.absent.append(f"{self.folder / (name + suffixes[0])} does not exist, but {named}")
         return found
 

@@ -19,9 +19,8 @@ from lapgs_wgpu.data.masks import MASKED, MOSTLY, Mask, MaskKind, check_masks, f
 from lapgs_wgpu.data.mover_cube import mover_cube
 from lapgs_wgpu.data.placement import place
 from lapgs_wgpu.data.readers import apps, colmap, hypernerf, panoptic, poses_bounds, transforms
-from lapgs_wgpu.data.split import held_out
 from lapgs_wgpu.data.stamps import natural_key
-from lapgs_wgpu.data.timestamps import as_one_camera, by_camera, disorder, in_step, read_times, to_unit_range
+from lapgs_wgpu.data.timestamps import as_one_camera, by_camera, disorder, held_out, in_step, read_times, to_unit_range
 from lapgs_wgpu.data.validation import check_cloud, check_film, check_frames, check_plausible, check_views, upright
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
@@ -181,7 +180,7 @@ def _timed(folder: Path, capture: Capture, warnings: list[str]) -> tuple[list[Fr
     names = [frame.name for frame in capture.frames]
     times, source = [frame.time for frame in capture.frames if frame.time is not None], capture.time_source
     if not times:
-        times, source = read_times(names, folder, warnings)
+        times, source = read_times(names, folder)
     if capture.own_footage:
         names = as_one_camera(names, times, [frame.place for frame in capture.frames])
         warnings += disorder(names, times, numbered=source.startswith("the frame numbers"))

@@ -5,16 +5,12 @@ from __future__ import annotations
 import os
 import secrets
 import shutil
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
 from lapgs_wgpu.errors import InputError
-
-_HELD_OPEN = (5, 32, 33)  # Windows' errors: access denied, sharing violation, lock violation
-_WAITS = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)  # seconds
 
 
 @contextmanager
@@ -32,7 +28,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
             yield file
             file.flush()
             os.fsync(file.fileno())
-        move(temporary, path)
+        os.replace(temporary, path)
     except OSError as error:
         _remove(temporary)
         if not path.parent.exists():
@@ -61,26 +57,11 @@ def new_folder(folder: Path, advice: str = "make room there, or name another") -
         with suppress(OSError):
             folder.rmdir()  # it is empty
         if not folder.exists():
-            move(unfinished, folder)
+            os.replace(unfinished, folder)
     except OSError as error:
         raise InputError(f"{folder} cannot be written ({error.strerror or error}); {advice}.") from None
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
-
-
-def move(source: Path, target: Path) -> None:
-    """os.replace, of a file or a folder. Raises OSError.
-
-    On Windows it fails while another program, such as a virus scanner, holds a file open; so it is tried again there
-    for three seconds.
-    """
-    for wait in (*_WAITS, None):
-        try:
-            return os.replace(source, target)
-        except PermissionError as error:
-            if wait is None or getattr(error, "winerror", None) not in _HELD_OPEN:
-                raise
-            time.sleep(wait)
 
 
 def _remove(path: Path) -> None:

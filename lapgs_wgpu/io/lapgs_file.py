@@ -72,12 +72,10 @@ def unpack_lapgs(data: bytes, where: str) -> tuple[dict[str, NDArray[Any]], dict
             f"{where}: has version {version} of the compact scene, and this program reads versions 1 to {VERSION}; "
             "export the scene again, or use the program that wrote it"
         )
-    if size > MAX_BYTES:
-        raise InputError(f"{where}: unpacks to {size} bytes, and a compact scene has at most {MAX_BYTES}")
-    if size > _MOST_RATIO * packed:
+    if size > min(MAX_BYTES, _MOST_RATIO * packed):
         raise InputError(
-            f"{where}: declares {size} bytes in {packed} packed ones, which hold {_MOST_RATIO} times their number at "
-            "most; the file is damaged"
+            f"{where}: declares {size} bytes in {packed} packed ones, of at most {MAX_BYTES}, and {_MOST_RATIO} times "
+            "the packed ones; the file is damaged"
         )
     unpacker = zlib.decompressobj()
     try:
@@ -85,8 +83,5 @@ def unpack_lapgs(data: bytes, where: str) -> tuple[dict[str, NDArray[Any]], dict
     except zlib.error as error:
         raise InputError(f"{where}: cannot be unpacked ({str(error)[:80]}); the file is damaged") from None
     if len(content) != size or not unpacker.eof or unpacker.unused_data:
-        held = "more, or are followed by others" if len(content) >= size else f"{len(content)}"
-        raise InputError(
-            f"{where}: declares {size} bytes, but its {packed} packed ones hold {held}; the file is damaged"
-        )
+        raise InputError(f"{where}: its {packed} packed bytes do not hold the {size} declared; the file is damaged")
     return unpack_tensors(io.BytesIO(content), size, where)

@@ -104,14 +104,11 @@ def _read_neu3d(folder: Path, image_size: int | None) -> Capture:
     path = folder / POSES
     recordings = _recordings(folder, image_size)
     rows = _read_rows(path, [recording.name for recording in recordings], "recordings", LLFF)
-    names = [recording.stem for recording in recordings]
-    warnings = []
+    names, warnings = [recording.stem for recording in recordings], []
     if names != sorted(names):
-        odd = next(i for i, name in enumerate(sorted(names)) if name != names[i])
         warnings.append(
-            f"{path}: its rows are taken in the order of the cameras' numbers, so row {odd} is of {names[odd]}; if "
-            f"they are in the order of the names, in which it is of {sorted(names)[odd]}, number the cameras with "
-            "leading zeros."
+            f"{path}: its rows are taken in the order of the cameras' numbers, {', '.join(names)}; if they are in that "
+            "of the names, number the cameras with leading zeros."
         )
     first, *others = recordings
     count = len(recordings[first])
