@@ -44,10 +44,8 @@ def find_masks(folder: Path, names: Iterable[str], what: str) -> dict[str, Path]
     check_mask_folder(folder, what)
     masks, missing = _found(folder, names)
     if missing:
-        raise InputError(
-            f"{folder} lacks {len(missing)} of {len(missing) + len(masks)} masks, such as that of {missing[0]}; add a "
-            f"PNG for {what}."
-        )
+        count = f"{len(missing)} of {len(missing) + len(masks)}"
+        raise InputError(f"{folder} lacks {count} masks, such as that of {missing[0]}; add a PNG for {what}.")
     return masks
 
 
@@ -71,14 +69,10 @@ def find_covisible(folders: Sequence[Path], names: Sequence[str]) -> dict[str, P
 def _found(folder: Path, names: Iterable[str]) -> tuple[dict[str, Path], list[str]]:
     """The masks below a folder by image, and the images without. Names may differ as in `CaptureFiles.find`."""
     files = CaptureFiles(folder)
-    masks, missing = dict[str, Path](), list[str]()
-    for name in names:
-        found = files.find(f"{name}.png") or files.find(str(PurePosixPath(name).with_suffix(".png")))
-        if found is None:
-            missing.append(name)
-        else:
-            masks[name] = folder / found
-    return masks, missing
+    found = {
+        name: files.find(f"{name}.png") or files.find(str(PurePosixPath(name).with_suffix(".png"))) for name in names
+    }
+    return {name: folder / file for name, file in found.items() if file}, [name for name in found if not found[name]]
 
 
 def check_mask_size(path: Path, size: Size) -> None:

@@ -156,16 +156,12 @@ def gaussian_names(vertex: Element, known: set[str], path: PathLike) -> list[str
     names = _names(rest)
     missing = [name for name in names if name not in known]
     if missing:
-        more = f" and {len(missing) - 5} more" if len(missing) > 5 else ""
-        cloud = not any(name.startswith(("opacity", "scale_", "rot_")) for name in properties)
-        problem = (
-            "so it holds no Gaussians; a cloud of points is not shown, and a training may start at it"
-            if cloud
-            else "without which its Gaussians are not complete; export it with all properties of 3DGS"
-        )
+        problem = "without which its Gaussians are not complete; export it with all properties of 3DGS"
+        if not any(name.startswith(("opacity", "scale_", "rot_")) for name in properties):
+            problem = "so it holds no Gaussians; a cloud of points is not shown, and a training may start at it"
         raise InputError(
-            f"{path}: its element vertex lacks the property {', '.join(missing[:5])}{more} "
-            f"({len(properties)} properties found), {problem}"
+            f"{path}: its element vertex has {len(properties)} properties and lacks {len(missing)}, such as "
+            f"{', '.join(missing[:5])}, {problem}"
         )
     if vertex.count == 0:
         raise InputError(f"{path}: holds 0 Gaussians; at least 1 is needed")
