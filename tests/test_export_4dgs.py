@@ -180,9 +180,6 @@ def test_what_cannot_be_written_is_refused_before_the_work(
     monkeypatch.setattr("lapgs_wgpu.viewer.export_4dgs.linear_pieces", lambda *_: pytest.fail("minutes of work"))
     with pytest.raises(InputError, match="none"):
         export_4dgs(scene, tmp_path / "none" / "b.4dgs", 0.5)
-    (tmp_path / "b.4dgs").touch()
-    with pytest.raises(InputError, match="--overwrite"):
-        export_4dgs(scene, tmp_path / "b.4dgs", 0.5)
     moving_scene(device, FieldConfig(kind="static")).save(tmp_path / "still.ply")
     with pytest.raises(InputError, match="motion"):
         export_4dgs(load_scene(tmp_path / "still.ply", lambda: device), tmp_path / "c.4dgs", 0.5)

@@ -21,7 +21,6 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.constants import CONSTANTS
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.linear_light import directions, display_colors, linear_harmonics, sh_basis, to_display
-from lapgs_wgpu.viewer.export import check_free
 from lapgs_wgpu.viewer.export_loss import Loss, Written, measure, seen, upload
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene, nearest_axis
 from lapgs_wgpu.viewer.moving_files import AXES, LAST, SH_RANGE, harmonics_4dgs
@@ -34,21 +33,19 @@ _TIME_STEP = 1e-3  # seconds: the library rounds the middles of pieces to it (pr
 _PROGRESS = 1000
 
 
-def export_4dgs(scene: LoadedScene, file: Path, max_error: float, *, overwrite: bool = False) -> Loss:
+def export_4dgs(scene: LoadedScene, file: Path, max_error: float) -> Loss:
     """Write a `.4dgs` of a scene that moves, and compare what the library reads in it with the scene. Atomic.
 
     Args:
         max_error: how far a point of the ellipsoid of one standard deviation of a Gaussian may lie from where the field
             has it, pixels of the captured images at the distance of the focus.
 
-    Raises InputError where the file cannot be written or is there already, nothing moves or can be seen, or the package
-    fourdgs is missing.
+    Raises InputError where the file cannot be written, nothing moves or can be seen, or the package fourdgs is missing.
     """
     try:
         import fourdgs
     except ImportError:
         raise InputError(f"writing .4dgs needs fourdgs: {pip_install('export')}") from None
-    check_free(scene, file, overwrite)
     playback = scene.playback
     if not playback.moves:
         raise InputError(f"{scene.path}: holds no motion; --export FILE.ply writes it for other viewers.")

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from lapgs_wgpu.gpu.array import read_all
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.progress import Progress
-from lapgs_wgpu.viewer.export import check_free
 from lapgs_wgpu.viewer.export_loss import Loss, measure, of_playback
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene, direction, nearest_axis
 from lapgs_wgpu.viewer.moving_files import SampledPlayback
@@ -27,15 +26,14 @@ _TYPES = {
 }  # fmt: skip
 
 
-def export_usd(scene: LoadedScene, file: Path, frames: int, *, overwrite: bool = False) -> Loss:
+def export_usd(scene: LoadedScene, file: Path, frames: int) -> Loss:
     """Write Gaussians at `frames` times evenly from 0 to 1, and compare what usd-core reads with the scene. Atomic.
 
     Coordinates are the scene's, below a transform that turns its up axis to z where it is neither y nor z. Values that
     do not change have one sample.
-    Raises InputError where the file cannot be written or is there already, or usd-core is missing.
+    Raises InputError where the file cannot be written, or usd-core is missing.
     """
     pxr = load_pxr()
-    check_free(scene, file, overwrite)
     with atomic_write(file) as target, tempfile.TemporaryDirectory() as folder:
         made = Path(folder) / f"{file.stem}{'.usdc' if file.suffix.lower() == '.usdz' else file.suffix.lower()}"
         stage = pxr.Usd.Stage.CreateNew(str(made))
