@@ -29,8 +29,9 @@ def plain_factors(scene: LoadedScene) -> Floats:
         scene.camera(), (captured.width, captured.height), _VIEWS, None, scene.initial_view.arc
     ):
         now = scene.playback.at(t)
-        factors.append(_faded(*read_all([now.means, now.quats, now.scales]), camera))
-    return np.median(factors, axis=0)
+        means, quats, scales = read_all([now.means, now.quats, now.scales])
+        factors.append(_faded(means, quats, scales, camera))
+    return np.asarray(np.median(factors, axis=0))
 
 
 def _faded(means: Floats, quats: Floats, scales: Floats, camera: Camera) -> Floats:

@@ -291,7 +291,7 @@ def check_film(images: Sequence[Path]) -> list[str]:
     with ThreadPoolExecutor(4, thread_name_prefix="thumbnails") as pool:
         thumbnails = list(pool.map(lambda path: gray_thumbnail(path, THUMBNAIL), images))
     values = np.array([sharpness(thumbnail) for thumbnail in thumbnails])
-    blurry = [images[i].name for i in np.flatnonzero(blurred(values))]
+    blurry = [image.name for image, bad in zip(images, blurred(values), strict=True) if bad]
     repeated = [images[i].name for i in range(1, len(images)) if repeats(thumbnails[i], thumbnails[i - 1])]
     why = {
         "blurred": (blurry, f"have less than {BLURRED:g} of their neighbours' sharpness"),

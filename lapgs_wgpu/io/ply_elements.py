@@ -102,7 +102,7 @@ class PlyFile(NamedTuple):
                 table[number] = tuple(map(float, line.split()))
             except ValueError:
                 raise InputError(
-                    f"{self.path}: row {number} of {element.name}, {line[:80]!r}, does not hold {len(layout)} numbers; "
+                    f"{self.path}: row {number} of {element.name}, {line[:80]!r}, does not hold {len(element.properties)} numbers; "
                     "the file is damaged."
                 ) from None
         yield 0, table
