@@ -101,10 +101,8 @@ class PlyFile(NamedTuple):
             try:
                 table[number] = tuple(map(float, line.split()))
             except ValueError:
-                raise InputError(
-                    f"{self.path}: row {number} of {element.name}, {line[:80]!r}, does not hold {len(element.properties)} numbers; "
-                    "the file is damaged."
-                ) from None
+                what = f"{self.path}: row {number} of {element.name}, {line[:80]!r},"
+                raise InputError(f"{what} does not hold {len(element.properties)} numbers; it is damaged.") from None
         yield 0, table
 
 
