@@ -113,9 +113,7 @@ def read_gaussians(ply: PlyFile) -> GaussianSnapshot:
 def vertex_of(ply: PlyFile) -> Element:
     """The element that holds Gaussians. Raises InputError where there is none."""
     if "vertex" not in ply.elements:
-        raise InputError(
-            f"{ply.path}: has no element vertex without a list, so it holds no Gaussians; give a 3DGS .ply file"
-        )
+        raise InputError(f"{ply.path}: has no element vertex, so it holds no Gaussians; give a 3DGS .ply file")
     return ply.elements["vertex"]
 
 

@@ -206,12 +206,13 @@ def _place(
     end, line = start, 0
     placed: dict[str, Element] = {}
     for element in elements.values():
+        before = not text and "vertex" in elements and "vertex" not in placed
+        if element.has_lists and (element.name == "vertex" or before):
+            raise InputError(
+                f"{path}: element {element.name[:40]!r} has lists, which are read neither in vertex nor before it; "
+                "write the file again with another program."
+            )
         if element.has_lists and not text:
-            if "vertex" in elements and "vertex" not in {*placed, element.name}:
-                raise InputError(
-                    f"{path}: element {element.name[:40]!r}, which has lists, stands before vertex, which is read only "
-                    "where it stands first; write the file again with another program."
-                )
             return placed
         if not element.has_lists:
             placed[element.name] = element
