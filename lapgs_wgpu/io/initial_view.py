@@ -73,9 +73,10 @@ class InitialView(NamedTuple):
                 and np.allclose(camera.T_cam_world[:3, :3] @ camera.T_cam_world[:3, :3].T, np.eye(3), atol=1e-3)
             )
             if arc is not None:
-                arc = float(arc[0]), float(arc[1])
+                clockwise, counterclockwise = map(float, arc)
+                arc = clockwise, counterclockwise
                 usable = usable and min(arc) >= 0 and sum(arc) <= 360
-        except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError, IndexError):
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError):
             return None
         if not usable:
             return None
