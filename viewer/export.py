@@ -28,7 +28,7 @@ _FINER = (1.0, 1 / 8, 1 / 64, 1 / 512)  # factors of the largest errors, tried o
 
 def check_free(scene: LoadedScene, file: Path, overwrite: bool) -> None:
     """Raises InputError where a file must not be written: over the opened one, or another without `overwrite`."""
-    if scene.path is not None and file.exists() and file.samefile(scene.path):
+    if file.exists() and file.samefile(scene.path):
         raise InputError(f"{file}: is the opened file; take another name.")
     if file.exists() and not overwrite:
         raise InputError(f"{file}: is there already; --overwrite replaces it.")

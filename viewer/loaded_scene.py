@@ -33,7 +33,7 @@ class LoadedScene(NamedTuple):
     """path: where it came from. initial_view: camera, focus, up and frames to begin with. file: its content, None for
     moving files of others."""
 
-    path: Path | None
+    path: Path
     playback: Playback
     initial_view: InitialView
     file: SceneFile | None = None
