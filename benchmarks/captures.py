@@ -56,17 +56,17 @@ def megabytes(who: int = resource.RUSAGE_SELF) -> float:
 
 def unpack(folder: Path, films: int) -> None:
     """Unpack so many of the films, which are copies of one; the pictures of the others become links to the first's."""
-    from lapgs_wgpu.data import load_dataset
-    from lapgs_wgpu.data.video_frames import Video
+    from lapgs_wgpu.data.video_frames import Display, frames_folder, unpacked
 
-    data = load_dataset(folder)
     first, *others = sorted(folder.glob("*.mp4"))
-    size = data.test[0].camera.width, data.test[0].camera.height
-    for video in (first, *others[: films - 1]):
-        Video(video).read(0, size)
-    for video in others[films - 1 :]:
-        if not Video(video)._folder(size).is_dir():
-            shutil.copytree(Video(first)._folder(size), Video(video)._folder(size), copy_function=os.link)
+    for film in others[: films - 1]:
+        unpacked(film, None)
+    size = unpacked(first, None)[0].size
+    upright = Display(0, False)
+    for film in others[films - 1 :]:
+        copy = frames_folder(film, size, upright)
+        if not copy.is_dir():
+            shutil.copytree(frames_folder(first, size, upright), copy, copy_function=os.link)
 
 
 def train(folder: Path, out: Path, preset: str, cache_gb: float, still: int, moving: int) -> dict[str, float]:

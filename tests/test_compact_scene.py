@@ -174,12 +174,11 @@ def rewritten(path: Path, content: bytes, version: int = 1, size: int | None = N
     [
         (3, None, b"", "has version 3 of the compact scene, and this program reads versions 1 to 2"),
         (0, None, b"", "has version 0 of the compact scene"),
-        (1, MAX_BYTES + 1, b"", f"unpacks to {MAX_BYTES + 1} bytes, and a compact scene has at most {MAX_BYTES}"),
-        (1, 10**6, b"", "declares 1000000 bytes in [0-9]+ packed ones, which hold 64 times"),
-        (1, 20, b"", "hold 19;"),
-        (1, 18, b"", "hold more"),
-        (1, None, b"more", "hold more, or are followed by others"),
-        (1, 3, b"", "hold more"),
+        (1, MAX_BYTES + 1, b"", f"declares {MAX_BYTES + 1} bytes"),
+        (1, 10**6, b"", "declares 1000000 bytes in [0-9]+ packed ones"),
+        (1, 20, b"", "do not hold the 20"),
+        (1, 18, b"", "do not hold the 18"),
+        (1, None, b"more", "do not hold"),
     ],
 )
 def test_containers_that_are_refused(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from lapgs_wgpu.data import load_dataset, synthetic
-from lapgs_wgpu.data.synthetic import FREQUENCIES, TOYS, cameras, render, trajectories, write_synthetic
+from lapgs_wgpu.data.synthetic import TOYS, cameras, render, write_synthetic
 from lapgs_wgpu.errors import InputError
 
 SMALL: dict[str, Any] = {"size": 24, "train_views": 5, "test_views": 2}
@@ -21,15 +21,12 @@ def files(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-@pytest.mark.parametrize("frequencies", [FREQUENCIES, (1.3, 2.7)])
-def test_each_trajectory_holds_one_frequency(frequencies: tuple[float, ...]) -> None:
+def test_each_path_holds_one_frequency() -> None:
     times = np.linspace(0, 1, 101)
-    paths = trajectories(times, frequencies)
-    assert list(paths) == [toy.name for toy in TOYS[: len(frequencies)]]
-    for toy, f in zip(TOYS, frequencies, strict=False):
-        path = paths[toy.name]
+    for toy in TOYS:
+        path = toy.path(times)
         assert path.shape == (101, 3)
-        phase = 2 * np.pi * f * times
+        phase = 2 * np.pi * toy.cycles * times
         basis = np.stack([np.ones_like(times), np.cos(phase), np.sin(phase)], axis=1)
         np.testing.assert_allclose(basis @ np.linalg.lstsq(basis, path, rcond=None)[0], path, atol=1e-12)
         assert toy.turns or np.ptp(path, axis=0).max() > 0.5
@@ -40,17 +37,16 @@ def test_each_trajectory_holds_one_frequency(frequencies: tuple[float, ...]) -> 
 def test_toys_are_seen_where_their_trajectories_are() -> None:
     """What appears in the picture when a toy is added lies within the toy's outline about its projected centre."""
     times = np.linspace(0, 1, 7)
-    paths = trajectories(times)
-    seen = dict.fromkeys(paths, 0)
+    seen = dict.fromkeys(TOYS, 0)
     for camera, time, index in zip(cameras(7, 3, size=64), times, range(7), strict=True):
-        pictures = [render(camera, time, FREQUENCIES[:count]).astype(int) for count in range(len(TOYS) + 1)]
+        pictures = [render(camera, time, TOYS[:count]).astype(int) for count in range(len(TOYS) + 1)]
         for toy, before, after in zip(TOYS, pictures, pictures[1:], strict=False):
             rows, columns = np.nonzero((before != after).any(axis=2))
-            x, y, z = camera.K @ (camera.T_cam_world @ [*paths[toy.name][index], 1])[:3]
+            x, y, z = camera.K @ (camera.T_cam_world @ [*toy.path(times)[index], 1])[:3]
             reach = toy.radius * (3**0.5 if toy.shape == "box" else 1) * camera.K[0, 0] / (z - toy.radius)
             offset = np.stack([columns + 0.5 - x / z, rows + 0.5 - y / z])
             assert (np.linalg.norm(offset, axis=0) < reach + 1).all()
-            seen[toy.name] += len(rows)
+            seen[toy] += len(rows)
             if toy is TOYS[0]:  # nothing hides it: the centres agree
                 assert np.abs(offset.mean(axis=1)).max() < 1
     assert min(seen.values()) > 7 * 20
@@ -87,8 +83,8 @@ def test_the_same_scene_is_reused_and_others_are_refused(tmp_path: Path) -> None
     stamp, before = picture.stat().st_mtime_ns, files(folder)
     write_synthetic(folder, **SMALL)
     assert picture.stat().st_mtime_ns == stamp
-    with pytest.raises(InputError, match=r"toys holds another built-in scene .*seed 0 instead of 4"):
-        write_synthetic(folder, **SMALL, seed=4)
+    with pytest.raises(InputError, match=r"toys holds another built-in scene .*train_views 5 instead of 6"):
+        write_synthetic(folder, **(SMALL | {"train_views": 6}))
     (folder / "synthetic.json").write_text("{spoilt")
     with pytest.raises(InputError, match="toys is not empty"):
         write_synthetic(folder, **SMALL)

@@ -5,9 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import stat
-import time
 from collections.abc import Callable
-from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -223,33 +221,6 @@ def test_folder_that_cannot_be_forced_to_the_disk(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(os, "fsync", refuse_folders)
     write_ply(tmp_path / "a.ply", random_still(2))
     assert_same(read_ply(tmp_path / "a.ply"), random_still(2))
-
-
-@pytest.mark.parametrize(
-    ("winerror", "failures", "moved"), [(5, 3, True), (32, 1, True), (32, 99, False), (80, 1, False)]
-)
-def test_a_file_that_another_program_holds_for_moments(
-    winerror: int, failures: int, moved: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As Windows' virus scanners do."""
-    real, waits = os.replace, []
-
-    def held(source: Path, target: Path) -> None:
-        if len(waits) < failures:
-            error = PermissionError(errno.EACCES, "Access is denied")
-            error.winerror = winerror
-            raise error
-        real(source, target)
-
-    monkeypatch.setattr(os, "replace", held)
-    monkeypatch.setattr(time, "sleep", waits.append)
-    path = tmp_path / "a"
-    path.write_bytes(b"old")
-    with nullcontext() if moved else pytest.raises(InputError, match="Access is denied"), atomic_write(path) as file:
-        file.write(b"new")
-    assert path.read_bytes() == (b"new" if moved else b"old")
-    assert len(waits) == (failures if moved else 0 if winerror == 80 else 6)
-    assert os.listdir(tmp_path) == ["a"]
 
 
 def test_written_file_is_forced_to_the_disk_before_it_gets_its_name(

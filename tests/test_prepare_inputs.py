@@ -13,8 +13,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from lapgs_wgpu.data import load_dataset
-from lapgs_wgpu.data.readers.calibration import match_names, read_calibration
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.prepare.calibration import match_names, read_calibration
 from lapgs_wgpu.prepare.capture import prepare
 from lapgs_wgpu.prepare.inputs import open_inputs
 from lapgs_wgpu.splat.camera import Camera

@@ -124,7 +124,7 @@ def test_a_trained_scene(window: Browser, folder: Path, device: Device) -> None:
     train(config, open_dataset(config), run, device=device)
     loaded = load_scene(run / "checkpoint.ply", lambda: device)
     for ending in ("lapgs", "html"):
-        export_compact(loaded, folder / f"demo.{ending}", overwrite=True)
+        export_compact(loaded, folder / f"demo.{ending}")
     open_page(window, (folder / "demo.html").as_uri())
     desktop = Desktop(folder / "demo.lapgs", device)
 

@@ -21,8 +21,6 @@ def capture_views(scene: LoadedScene) -> tuple[View, ...]:
     """
     from lapgs_wgpu.data import load_dataset  # not before the first picture
 
-    if scene.path is None:
-        return ()
     metadata = scene.playback.metadata  # empty for files of other projects; tells whether the capture was normalized
     try:
         data = read_toml(scene.path.parent / "config.toml")["data"]

@@ -167,20 +167,22 @@ def _export(given: Any, scene: LoadedScene) -> None:
     file, overwrite = Path(given.export), bool(given.overwrite)
     ending, count = file.suffix.lower(), scene.playback.count
     line = f"{count} Gaussians"
+    if ending in (".4dgs", ".lapgs", ".html", ".ply", *USD):
+        export.check_free(scene, file, overwrite)
     if ending == ".4dgs":
         from lapgs_wgpu.viewer.export_4dgs import MAX_ERROR, export_4dgs
 
-        loss = export_4dgs(scene, file, given.max_error or MAX_ERROR, overwrite=overwrite)
+        loss = export_4dgs(scene, file, given.max_error or MAX_ERROR)
     elif ending in USD:
         from lapgs_wgpu.viewer.export_usd import export_usd
 
         frames = given.frames or max(61, scene.clock().frames) if scene.playback.moves else 1
-        loss = export_usd(scene, file, frames, overwrite=overwrite)
+        loss = export_usd(scene, file, frames)
         line = f"{count} Gaussians at {frames} times"
     elif ending in (".lapgs", ".html"):
-        loss = export.export_compact(scene, file, overwrite=overwrite)
+        loss = export.export_compact(scene, file)
     elif ending == ".ply":
-        loss = export.export_still(scene, file, given.time or 0.0, overwrite=overwrite)
+        loss = export.export_still(scene, file, given.time or 0.0)
         line = f"{count} Gaussians at time {given.time or 0.0:g}"
     else:
         loss = export.export_frames(scene, file, given.frames, overwrite=overwrite)
@@ -189,16 +191,11 @@ def _export(given: Any, scene: LoadedScene) -> None:
     print(f"{file}: {line}{size}, {loss.psnr:.1f} dB PSNR against {scene.path}")
     if loss.reason:
         print(f"warning: the loss is seen: {loss.reason}.", file=sys.stderr)
-    # Our own formats say whether the scene is antialiased, and all programs that play them know it.
-    if ending not in (".lapgs", ".html") and scene.playback.at(0.0).antialiased:
-        says = (
-            "no player reads from this format"
-            if ending in (".4dgs", *USD)
-            else "its comment 'SplatRenderMode: mip' tells few viewers"
-        )
+    # Our own formats say whether the scene is antialiased; for .4dgs and OpenUSD opacities are fitted to plain drawing.
+    if ending not in (".4dgs", ".lapgs", ".html", *USD) and scene.playback.at(0.0).antialiased:
         print(
-            f"note: the scene was trained antialiased, which {says}: where they offer antialiased drawing, turn it on; "
-            "elsewhere thin places look a little thicker.",
+            "note: the scene was trained antialiased, which the comment 'SplatRenderMode: mip' tells few viewers: "
+            "where they offer antialiased drawing, turn it on; elsewhere thin places look a little thicker.",
             file=sys.stderr,
         )
 

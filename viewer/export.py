@@ -28,19 +28,17 @@ _FINER = (1.0, 1 / 8, 1 / 64, 1 / 512)  # factors of the largest errors, tried o
 
 def check_free(scene: LoadedScene, file: Path, overwrite: bool) -> None:
     """Raises InputError where a file must not be written: over the opened one, or another without `overwrite`."""
-    if scene.path is not None and file.exists() and file.samefile(scene.path):
+    if file.exists() and file.samefile(scene.path):
         raise InputError(f"{file}: is the opened file; take another name.")
     if file.exists() and not overwrite:
         raise InputError(f"{file}: is there already; --overwrite replaces it.")
 
 
-def export_still(scene: LoadedScene, file: Path, time: float, *, overwrite: bool = False) -> Loss:
+def export_still(scene: LoadedScene, file: Path, time: float) -> Loss:
     """Write the Gaussians at a time in [0, 1], and compare what the file holds then with the scene. Atomic.
 
-    Raises InputError where it cannot be written, where the file is there already and `overwrite` is not given, and
-    always where it is the opened file, whose motion would be lost.
+    Raises InputError where it cannot be written.
     """
-    check_free(scene, file, overwrite)
     _write_still(scene, file, time)
     return measure(scene, of_playback(playback_of(read_scene(file), scene.playback.device)), time)
 
@@ -86,17 +84,15 @@ def export_frames(scene: LoadedScene, folder: Path, frames: int, *, overwrite: b
     return measure(scene, of_playback(written), frames=frames)
 
 
-def export_compact(scene: LoadedScene, file: Path, *, overwrite: bool = False) -> Loss:
+def export_compact(scene: LoadedScene, file: Path) -> Loss:
     """Write a compact scene (.lapgs), or a web page with one inside (.html), and compare it with the scene. Atomic.
 
-    Raises InputError where it cannot be written, where the file is there already and `overwrite` is not given, and
-    where only torch evaluates the field.
+    Raises InputError where it cannot be written, and where only torch evaluates the field.
     """
     if scene.file is None:
         raise InputError(
             f"{scene.path}: holds no field of lapgs_wgpu; --export takes a folder, or a .ply, .usd or .4dgs."
         )
-    check_free(scene, file, overwrite)
     with atomic_write(file) as target:  # before a minute of work
         content, loss = _compact(scene, scene.file)
         if file.suffix.lower() == ".html":

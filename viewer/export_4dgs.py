@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import math
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,40 +16,36 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.playback.linear_pieces import Pieces, linear_pieces
-from lapgs_wgpu.motion.playback.playback import Playback
 from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.constants import CONSTANTS
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.linear_light import directions, display_colors, linear_harmonics, sh_basis, to_display
-from lapgs_wgpu.viewer.export import check_free
 from lapgs_wgpu.viewer.export_loss import Loss, Written, measure, seen, upload
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene, nearest_axis
 from lapgs_wgpu.viewer.moving_files import AXES, LAST, SH_RANGE, harmonics_4dgs
+from lapgs_wgpu.viewer.plain_opacity import plain_factors
 
 MAX_ERROR = 0.5  # pixels, without --max-error
 _SHADE = 4 / 255  # largest change of opacity and color within a piece
 _OF_LINES = 0.85  # share of the error that straight lines may use up; the rest is for the format's rounding
 _TIME_STEP = 1e-3  # seconds: the library rounds the middles of pieces to it (profile "fine")
 _PROGRESS = 1000
-_CHECKS = 97  # times at which the written file is compared with the playback
 
 
-def export_4dgs(scene: LoadedScene, file: Path, max_error: float, *, overwrite: bool = False) -> Loss:
+def export_4dgs(scene: LoadedScene, file: Path, max_error: float) -> Loss:
     """Write a `.4dgs` of a scene that moves, and compare what the library reads in it with the scene. Atomic.
 
     Args:
         max_error: how far a point of the ellipsoid of one standard deviation of a Gaussian may lie from where the field
             has it, pixels of the captured images at the distance of the focus.
 
-    Raises InputError where the file cannot be written or is there already, nothing moves or can be seen, or the package
-    fourdgs is missing.
+    Raises InputError where the file cannot be written, nothing moves or can be seen, or the package fourdgs is missing.
     """
     try:
         import fourdgs
     except ImportError:
         raise InputError(f"writing .4dgs needs fourdgs: {pip_install('export')}") from None
-    check_free(scene, file, overwrite)
     playback = scene.playback
     if not playback.moves:
         raise InputError(f"{scene.path}: holds no motion; --export FILE.ply writes it for other viewers.")
@@ -63,6 +58,7 @@ def export_4dgs(scene: LoadedScene, file: Path, max_error: float, *, overwrite: 
             progress.at(_PROGRESS)
         if not len(pieces.source):
             raise InputError(f"{scene.path}: holds no Gaussians that can be seen.")
+        pieces = pieces._replace(opacities=pieces.opacities * plain_factors(scene)[pieces.source])
         options = fourdgs.WriteOptions(
             profile="fine",
             library="lapgs_wgpu",
@@ -76,25 +72,7 @@ def export_4dgs(scene: LoadedScene, file: Path, max_error: float, *, overwrite: 
         written = io.BytesIO()
         fourdgs.write(written, _gaussian_set(pieces, sh, seconds), seconds, options=options, camera=view)
         target.write(written.getvalue())
-    read = fourdgs.read(written.getvalue())
-    off = _largest_shift(read, playback) / pixel
-    if off > max_error:
-        print(
-            f"warning: {file}: Gaussians lie up to {off:.2f} pixels from the learned motion, more than --max-error "
-            f"{max_error:g}, since the format rounds what it stores; a smaller --max-error brings them nearer.",
-            file=sys.stderr,
-        )
-    return measure(scene, _shown(read, playback.device))
-
-
-def _largest_shift(read: Any, playback: Playback) -> float:
-    """Return the largest distance of means in a file from the playback's, world units, over _CHECKS times."""
-    largest = 0.0
-    for t in np.linspace(0, LAST, _CHECKS).tolist():
-        now, means = read.gaussians.state_at(t * read.duration_sec), playback.at(t).means.read()
-        shift = now["centers"] - means[read.gaussians.source_index[now["indices"]]]
-        largest = max(largest, float(np.linalg.norm(shift, axis=1).max(initial=0)))
-    return largest
+    return measure(scene, _shown(fourdgs.read(written.getvalue()), playback.device))
 
 
 def _gaussian_set(pieces: Pieces, sh: NDArray[np.float32], seconds: float) -> Any:

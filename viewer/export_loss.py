@@ -27,7 +27,6 @@ Rows = NDArray[np.integer]
 Written = Callable[[Camera, float], tuple[Gaussians[DeviceArray], Rows]]
 
 _PICTURES = 4
-_SIZE = (320, 240)
 _VISIBLE = 40.0  # dB; below it a file has lost what is seen
 # Property -> from which error on a Gaussian counts, and what it then does.
 _ERRORS = {
@@ -47,13 +46,17 @@ class Loss(NamedTuple):
 
 
 def measure(scene: LoadedScene, written: Written, time: float | None = None, frames: int | None = None) -> Loss:
-    """Compare small pictures from around the focus. time: of all, in [0, 1]; by default from the clip's start to its
-    end. frames: of a sequence, whose times the pictures have then."""
+    """Compare pictures of the captured images' size from around the focus.
+
+    time: of all, in [0, 1]; by default from the clip's start to its end. frames: of a sequence, whose times the
+    pictures have then.
+    """
     rasterizer = Rasterizer(scene.playback.device)
     if time is None and not scene.playback.moves:
         time = 0.0
-    pictures = []
-    for camera, t in orbit_views(scene.camera(), _SIZE, _PICTURES, time, scene.initial_view.arc):
+    pictures, captured = [], scene.initial_view.camera
+    size = captured.width, captured.height
+    for camera, t in orbit_views(scene.camera(), size, _PICTURES, time, scene.initial_view.arc):
         t = t if frames is None else round(t * (frames - 1)) / max(1, frames - 1)
         wanted = _draw(rasterizer, scene, scene.playback.at(t), camera)
         psnr = _psnr(wanted, _draw(rasterizer, scene, written(camera, t)[0], camera))

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from lapgs_wgpu.gpu.array import read_all
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.progress import Progress
-from lapgs_wgpu.viewer.export import check_free
 from lapgs_wgpu.viewer.export_loss import Loss, measure, of_playback
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene, direction, nearest_axis
 from lapgs_wgpu.viewer.moving_files import SampledPlayback
+from lapgs_wgpu.viewer.plain_opacity import plain_factors
 from lapgs_wgpu.viewer.usd_file import HARMONICS, KIND, load_pxr, read_usd
 
 Floats = NDArray[np.float32]
@@ -26,15 +26,14 @@ _TYPES = {
 }  # fmt: skip
 
 
-def export_usd(scene: LoadedScene, file: Path, frames: int, *, overwrite: bool = False) -> Loss:
+def export_usd(scene: LoadedScene, file: Path, frames: int) -> Loss:
     """Write Gaussians at `frames` times evenly from 0 to 1, and compare what usd-core reads with the scene. Atomic.
 
     Coordinates are the scene's, below a transform that turns its up axis to z where it is neither y nor z. Values that
     do not change have one sample.
-    Raises InputError where the file cannot be written or is there already, or usd-core is missing.
+    Raises InputError where the file cannot be written, or usd-core is missing.
     """
     pxr = load_pxr()
-    check_free(scene, file, overwrite)
     with atomic_write(file) as target, tempfile.TemporaryDirectory() as folder:
         made = Path(folder) / f"{file.stem}{'.usdc' if file.suffix.lower() == '.usdz' else file.suffix.lower()}"
         stage = pxr.Usd.Stage.CreateNew(str(made))
@@ -51,9 +50,7 @@ def export_usd(scene: LoadedScene, file: Path, frames: int, *, overwrite: bool =
 
 
 def _write(pxr: Any, stage: Any, scene: LoadedScene, frames: int) -> None:
-    antialiased = {"antialiased": "true"} if scene.playback.at(0.0).antialiased else {}
-    view = scene.initial_view._replace(frames=frames).to_json()
-    stage.GetRootLayer().customLayerData = {"view": view} | antialiased
+    stage.GetRootLayer().customLayerData = {"view": scene.initial_view._replace(frames=frames).to_json()}
     axis, tokens = nearest_axis(scene.initial_view.up), pxr.UsdGeom.Tokens
     pxr.UsdGeom.SetStageUpAxis(stage, tokens.y if axis == "y" else tokens.z)  # it knows these two
     pxr.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -74,10 +71,11 @@ def _write(pxr: Any, stage: Any, scene: LoadedScene, frames: int) -> None:
     uniform = {"custom": False, "variability": pxr.Sdf.VariabilityUniform}
     prim.CreateAttribute("radiance:sphericalHarmonicsDegree", types.Int, **uniform).Set(scene.playback.sh_degree)
     attributes = {name: prim.CreateAttribute(name, getattr(types, kind), custom=False) for name, kind in _TYPES.items()}
+    factors = plain_factors(scene).astype(np.float32)
     last: dict[str, tuple[int, Floats]] = {}  # what was written, and for which frame
     with Progress(frames, "frames") as progress:
         for number, t in enumerate(np.linspace(0, 1, frames).tolist()):
-            for name, values in _values(scene, t).items():
+            for name, values in _values(scene, t, factors).items():
                 if name == "orientations" and name in last:  # -q turns as q does, but not what lies between frames
                     values[(values * last[name][1]).sum(axis=1) < 0] *= -1
                 if name in last and np.array_equal(values, last[name][1]):
@@ -92,14 +90,14 @@ def _write(pxr: Any, stage: Any, scene: LoadedScene, frames: int) -> None:
             progress.step()
 
 
-def _values(scene: LoadedScene, t: float) -> dict[str, Floats]:
-    """The attributes' values at a time."""
+def _values(scene: LoadedScene, t: float, factors: Floats) -> dict[str, Floats]:
+    """The attributes' values at a time. factors: (N,) of the opacities."""
     now = scene.playback.at(t)
     means, quats, scales, opacities, sh = read_all([now.means, now.quats, now.scales, now.opacities, now.sh])
     quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
     reach = 3 * scales.max(axis=1, keepdims=True)
     extent = np.stack([(means - reach).min(axis=0), (means + reach).max(axis=0)])
-    arrays = (means, quats, scales, opacities, sh.reshape(-1, 3), extent)
+    arrays = (means, quats, scales, factors * opacities, sh.reshape(-1, 3), extent)
     return dict(zip(_TYPES, arrays, strict=True))
 
 

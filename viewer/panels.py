@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, TypeVar
 
 from imgui_bundle import imgui
 from wgpu.utils.imgui import ImguiRenderer
 
+from lapgs_wgpu.viewer.clock import LOOPS, SPEEDS
 from lapgs_wgpu.viewer.key_bindings import KEYS, MOUSE
 from lapgs_wgpu.viewer.present import HEAT
 from lapgs_wgpu.viewer.render_modes import BACKGROUNDS, MODES
-from lapgs_wgpu.viewer.time_slider import draw_time_slider
-from lapgs_wgpu.viewer.training_control import TrainingControl
 from lapgs_wgpu.viewer.view_state import ViewState
 from lapgs_wgpu.viewer.viewport import Viewport
-from lapgs_wgpu.viewer.widgets import button, choice, tip
 
+T = TypeVar("T")
 _FIXED = imgui.WindowFlags_.no_move | imgui.WindowFlags_.no_resize | imgui.WindowFlags_.no_saved_settings
 _BAR = _FIXED | imgui.WindowFlags_.no_title_bar | imgui.WindowFlags_.no_scrollbar
 _GAP = 8.0
@@ -81,7 +81,7 @@ class Panels:
             imgui.set_next_window_pos((_GAP, height - _BAR_HEIGHT - _GAP))
             imgui.set_next_window_size((width - 2 * _GAP, _BAR_HEIGHT))
             imgui.begin("transport", None, _BAR)
-            draw_time_slider(state)
+            _time_slider(state)
             self._end()
 
     # The panel at the left -------------------------------------------------------------------------------------------
@@ -91,44 +91,29 @@ class Panels:
         imgui.set_next_window_pos((_GAP, _GAP))
         imgui.set_next_window_size((_SIDE, 0))
         imgui.begin("View", None, _FIXED)
-        state.mode = choice("mode", state.mode, state.renderer.modes())
-        tip(MODES[state.mode])
+        state.mode = _choice("mode", state.mode, state.renderer.modes())
+        _tip(MODES[state.mode])
         frame = self.viewport.frame
         if frame is not None and frame.image.shows in ("depth", "value"):
             _legend(frame.image.low, frame.image.high)
-        state.background = choice("ground", state.background, list(BACKGROUNDS.values()), list(BACKGROUNDS))
-        tip("background")
+        state.background = _choice("ground", state.background, list(BACKGROUNDS.values()), list(BACKGROUNDS))
+        _tip("background")
         _, state.antialiased = imgui.checkbox("antialiased", state.antialiased)
-        tip("Mip-Splatting's filter, as antialiased trainings draw (X)")
-        if button("Reset"):
+        _tip("Mip-Splatting's filter, as antialiased trainings draw (X)")
+        if _button("Reset"):
             state.reset_camera()
-        tip("camera back to where it started (R)")
+        _tip("camera back to where it started (R)")
         imgui.same_line()
-        if button("Help"):
+        if _button("Help"):
             state.show_help = not state.show_help
-        tip("keys and mouse (?)")
+        _tip("keys and mouse (?)")
         if state.flying:
             imgui.text_colored(_ACCENT, "flying: W A S D Q E, V ends")
-        if state.training is not None:
-            self._training(state.training)
         if state.views:
-            chosen = choice("camera", state.view, range(len(state.views)), [view.name for view in state.views])
+            chosen = _choice("camera", state.view, range(len(state.views)), [view.name for view in state.views])
             if chosen is not None and chosen != state.view:
                 state.stand_at(chosen)
         self._end()
-
-    def _training(self, training: TrainingControl) -> None:
-        imgui.separator_text("Training")
-        last = training.last
-        if last is not None:
-            imgui.progress_bar(last.step / last.steps, (-1, 0), f"step {last.step} of {last.steps}")
-            imgui.text(f"{last.psnr:.2f} dB   {self.state.scene.playback.count:,} Gaussians")
-        if button("Go on" if training.paused else "Pause"):
-            training.toggle_pause()
-        imgui.same_line()
-        if button("Step"):
-            training.step()
-        tip("one step of the optimizer, then pause")
 
     # Texts over the picture ------------------------------------------------------------------------------------------
 
@@ -166,6 +151,50 @@ class Panels:
         self.state.show_help = bool(stays)
 
 
+def _time_slider(state: ViewState) -> None:
+    """Fill the present imgui window with the slider and its transport: play, step, frame rate, speed, loop."""
+    clock = state.clock
+    imgui.begin_disabled(not state.scene.playback.moves)
+    last = clock.frames - 1
+    imgui.set_next_item_width(-1)
+    label = f"{clock.time:.3f}   frame {clock.frame} of {last}"
+    # imgui reads % in a format; the label has none.
+    moved, time = imgui.slider_float("##time", clock.time, 0.0, 1.0, label, imgui.SliderFlags_.no_input)
+    if imgui.is_item_deactivated() and imgui.is_mouse_released(imgui.MouseButton_.left):
+        # imgui leaves out where the mouse went since the last frame, which is far where frames take long.
+        moved, time = True, _slider_value()
+    if moved:
+        clock.playing = False
+        clock.seek(time)
+    for text, width, action in (
+        ("|<", 32, state.first_frame),
+        ("<", 32, state.previous_frame),
+        ("Pause" if clock.playing else "Play", 64, state.toggle_playing),
+        (">", 32, state.next_frame),
+        (">|", 32, state.last_frame),
+    ):
+        if _button(text, width):
+            action()
+        imgui.same_line()
+    imgui.set_next_item_width(70)
+    changed, fps = imgui.input_float("fps", clock.fps, 0.0, 0.0, "%.4g")
+    if changed:
+        clock.fps = min(max(fps, 0.1), 1000.0)
+    imgui.same_line()
+    speeds = sorted({*SPEEDS, clock.speed})
+    clock.speed = _choice("speed", clock.speed, speeds, [f"{speed:g}x" for speed in speeds], width=70)
+    imgui.same_line()
+    clock.loop = _choice("##loop", clock.loop, LOOPS, width=84)
+    imgui.end_disabled()
+
+
+def _slider_value() -> float:
+    """Return the value, 0 to 1, at which the grab of the last item, a slider, lies under the mouse."""
+    half_grab = imgui.get_style().grab_min_size / 2 + 2  # imgui's own padding
+    left, right = imgui.get_item_rect_min().x + half_grab, imgui.get_item_rect_max().x - half_grab
+    return float((imgui.get_mouse_pos().x - left) / max(right - left, 1.0))
+
+
 def _legend(low: float, high: float) -> None:
     """Draw the scale of colors with the values at its ends."""
     x, y = imgui.get_cursor_screen_pos()
@@ -189,3 +218,22 @@ def _style() -> None:
     style.set_color_(imgui.Col_.window_bg, (0.08, 0.08, 0.09, 0.85))
     style.set_color_(imgui.Col_.slider_grab, _ACCENT)
     style.set_color_(imgui.Col_.slider_grab_active, _ACCENT)
+
+
+def _button(label: str, width: float = 66) -> bool:
+    """Draw a button; returns whether it was pressed."""
+    return bool(imgui.button(label, (width, 0)))
+
+
+def _choice(label: str, present: T, choices: Sequence[T], names: Sequence[str] | None = None, width: float = -70) -> T:
+    """Draw a list; returns the choice, `present` until the user takes another. names: labels of the choices."""
+    imgui.set_next_item_width(width)
+    at = choices.index(present) if present in choices else -1
+    changed, chosen = imgui.combo(label, at, list(map(str, choices if names is None else names)))
+    return choices[chosen] if changed else present
+
+
+def _tip(text: str) -> None:
+    """Show a text while the pointer rests on the last item."""
+    if imgui.is_item_hovered(imgui.HoveredFlags_.allow_when_disabled):
+        imgui.set_tooltip(text)

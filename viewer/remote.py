@@ -18,10 +18,10 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from lapgs_wgpu.errors import InputError, pip_install
-from lapgs_wgpu.viewer.gui_library import check_imgui
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 from lapgs_wgpu.viewer.view_state import ViewState
 from lapgs_wgpu.viewer.web_page import web_file
+from lapgs_wgpu.viewer.window import check_imgui
 
 Message = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[Message]]
@@ -91,7 +91,7 @@ def run_remote(scene: LoadedScene, entry: Entry, start: Callable[[ViewState], No
     # The page is rendercanvas's, whose scripts it uses, but its canvas fills the window.
     # rendercanvas takes Ctrl-C from uvicorn when its loop starts, closes the canvas and leaves the server running.
     loop._BaseLoop__setup_interrupt_hooks = dict
-    name = scene.path.name if scene.path else "lapgs-view"
+    name = scene.path.name
     resources["index.html"] = "text/html", web_file("remote.html").replace("{{title}}", html.escape(name))
     app = App(RemoteCanvas(title=name, update_mode="ondemand", max_fps=60), loop, scene)
     start(app.state)
@@ -108,7 +108,7 @@ def run_remote(scene: LoadedScene, entry: Entry, start: Callable[[ViewState], No
         ws_ping_timeout=30,
         timeout_graceful_shutdown=2,
     )
-    print(entry.welcome(str(scene.path or name)), file=sys.stderr, flush=True)
+    print(entry.welcome(str(scene.path)), file=sys.stderr, flush=True)
     server = uvicorn.Server(config)
     app.end = partial(setattr, server, "should_exit", True)
     asyncio.run(server.serve(sockets=[entry.listening]))

@@ -43,7 +43,6 @@ def read_usd(path: Path) -> MovingFile:
     start, end = stage.GetStartTimeCode(), stage.GetEndTimeCode()
     shapes = {"positions": (count, 3), "orientations": (count, 4), "scales": (count, 3), "opacities": (count,)}
     shapes[HARMONICS] = (count * (degree + 1) ** 2, 3)
-    data = dict(stage.GetRootLayer().customLayerData)
 
     @lru_cache(maxsize=2)
     def sample(t: float) -> Gaussians[NDArray[np.float32]]:
@@ -53,10 +52,9 @@ def read_usd(path: Path) -> MovingFile:
                 raise InputError(f"{path}: {name} of {place} has shape {found[name].shape}, not finite {shape}.")
         means, quats, scales, opacities, sh = found.values()
         sh = sh.reshape(count, -1, 3)
-        return Gaussians(
-            means, np.roll(quats, 1, axis=1), scales, opacities, sh, antialiased=data.get("antialiased") == "true"
-        )
+        return Gaussians(means, np.roll(quats, 1, axis=1), scales, opacities, sh)
 
+    data = dict(stage.GetRootLayer().customLayerData)
     metadata = {"fps": str(stage.GetTimeCodesPerSecond())} | {k: str(v) for k, v in data.items() if k == "view"}
     return MovingFile(sample, max(1, round(end - start) + 1), metadata)
 

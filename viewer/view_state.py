@@ -10,7 +10,6 @@ from lapgs_wgpu.viewer.clock import LOOPS, SPEEDS
 from lapgs_wgpu.viewer.frame import FrameRenderer
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 from lapgs_wgpu.viewer.render_modes import BACKGROUNDS, Mode
-from lapgs_wgpu.viewer.training_control import TrainingControl
 
 if TYPE_CHECKING:
     from lapgs_wgpu.data import View
@@ -20,8 +19,7 @@ class ViewState:
     """Panels read and set the attributes; keys call the methods and turn the flags (viewer/key_bindings). Knows no
     window and no GUI.
 
-    view: number of the capture's camera that was chosen last, or None. training: the training under way; None where a
-    file is shown.
+    view: number of the capture's camera that was chosen last, or None.
     """
 
     def __init__(self, scene: LoadedScene) -> None:
@@ -29,7 +27,6 @@ class ViewState:
         self.show_panels = self.show_overlay = True
         self.show_help = False
         self.flying = False
-        self.training: TrainingControl | None = None
         self.scene, self.renderer = scene, FrameRenderer(scene.playback)
         self.camera, self.clock = scene.camera(), scene.clock()
         self.background = scene.background
@@ -88,14 +85,6 @@ class ViewState:
     def next_view(self) -> None:
         if self.views:
             self.stand_at((self.view + 1 if self.view is not None else 0) % len(self.views))
-
-    def toggle_pause(self) -> None:
-        if self.training is not None:
-            self.training.toggle_pause()
-
-    def step_training(self) -> None:
-        if self.training is not None:
-            self.training.step()
 
 
 def _next(choices: Any, present: Any) -> Any:

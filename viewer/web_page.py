@@ -5,17 +5,16 @@ from __future__ import annotations
 import base64
 import hashlib
 import html
-import io
 import json
 import re
 from collections.abc import Iterable
 from importlib import resources
 from typing import Any
 
-import imageio.v3 as iio
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_wgpu.data.images import encode_jpeg
 from lapgs_wgpu.gpu.shader import Binding, Defines, browser_source, compose, reflect, struct_layout
 from lapgs_wgpu.motion.fields.config import MIN_SCALE
 from lapgs_wgpu.splat.drawing import sh_defines
@@ -58,7 +57,7 @@ PASSES: dict[str, tuple[str, Defines]] = {
 }  # fmt: skip
 _FIELD = ("hashgrid_slice", "hashgrid SLICED", "hashgrid")  # beside one of deform
 _CHOSEN = ("color", "rasterize", "deform")  # one of each
-_DESKTOP_ACTIONS = ("next_mode", "next_view", "toggle_pause", "step_training")
+_DESKTOP_ACTIONS = ("next_mode", "next_view")
 
 
 def player_data() -> dict[str, Any]:
@@ -122,8 +121,6 @@ def page_html(scene: bytes, title: str, poster: NDArray[np.uint8], *, narrowest:
         "base-uri 'none'",
         "form-action 'none'",
     ])  # fmt: skip
-    picture = io.BytesIO()
-    iio.imwrite(picture, poster, extension=".jpg", quality=80)
     gestures = [
         *((key.shown, key.help) for key in page_keys()),
         *MOUSE,
@@ -133,7 +130,7 @@ def page_html(scene: bytes, title: str, poster: NDArray[np.uint8], *, narrowest:
         "policy": policy,
         "title": html.escape(title),
         "style": style,
-        "poster": f"data:image/jpeg;base64,{base64.b64encode(picture.getvalue()).decode()}",
+        "poster": f"data:image/jpeg;base64,{base64.b64encode(encode_jpeg(poster, quality=80)).decode()}",
         "player": json.dumps(player_data(), separators=(",", ":")).replace("<", "\\u003c"),
         "scene": base64.b64encode(scene).decode(),
         "script": script,
@@ -145,7 +142,7 @@ def page_html(scene: bytes, title: str, poster: NDArray[np.uint8], *, narrowest:
 
 
 def page_keys() -> list[KeyBinding]:
-    """The keys of lapgs-view that a page has a use for: it shows no capture and no training."""
+    """The keys of lapgs-view that a page has a use for: it shows no capture."""
     return [key for key in KEYS if key.action not in _DESKTOP_ACTIONS]
 
 

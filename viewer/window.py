@@ -10,7 +10,6 @@ from typing import Any
 
 from lapgs_wgpu.errors import InputError, pip_install
 from lapgs_wgpu.viewer.app import App
-from lapgs_wgpu.viewer.gui_library import check_imgui
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 from lapgs_wgpu.viewer.view_state import ViewState
 
@@ -29,6 +28,18 @@ def check_window(otherwise: str) -> None:
     missing = sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     reason = "there is no display" if missing else "glfw finds no display that it can use"
     raise InputError(f"no window can be opened here ({reason}): {otherwise}.")
+
+
+def check_imgui() -> None:
+    """Raises InputError where the package is missing, or a library of the system that it does not bring."""
+    try:
+        import imgui_bundle  # noqa: F401
+    except ModuleNotFoundError:
+        raise InputError(f"the viewer needs imgui-bundle: {pip_install('viewer')}.") from None
+    except ImportError as error:
+        raise InputError(
+            f"imgui-bundle cannot be loaded ({error}); on Debian and Ubuntu: sudo apt-get install -y libx11-6 libxext6."
+        ) from None
 
 
 def run_window(scene: LoadedScene, size: tuple[int, int], start: Callable[[ViewState], None]) -> None:

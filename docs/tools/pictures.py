@@ -93,7 +93,7 @@ def main(run: Path, folder: Path) -> None:
         Image.fromarray(picture).save(folder / name, optimize=True)
     with atomic_write(folder / "demo.webp") as file:
         file.write(moving(scene))
-    export_compact(scene, folder / "demo.html", overwrite=True)
+    export_compact(scene, folder / "demo.html")
     for path in sorted(folder.iterdir()):
         print(f"{path}: {path.stat().st_size:,} bytes")
 

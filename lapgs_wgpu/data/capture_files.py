@@ -50,7 +50,10 @@ class CaptureFiles:
         if ".." in parts:
             return None
         for part in parts:
-            entries = self._folded_entries(at)
+            if at not in self._entries:
+                names = sorted(os.listdir(at), reverse=True) if os.path.isdir(at) else []
+                self._entries[at] = {_folded(name): name for name in names}
+            entries = self._entries[at]
             found = part if os.path.exists(at / part) else entries.get(_folded(part))
             if found is None and (images := _SMALLER.sub(r"\1", _folded(part))) == "images":
                 found = next((entries[key] for key in sorted(entries) if _SMALLER.sub(r"\1", key) == images), None)
@@ -66,9 +69,9 @@ class CaptureFiles:
         """
         suffixes = ("",) if name.lower().endswith(SUFFIXES) else SUFFIXES
         found = next((found for suffix in suffixes if (found := self.find(name + suffix))), None)
-        if found is None and os.path.isfile(self.folder / name):
-            check_image(self.folder / name)  # says what it is
         if found is None:
+            if os.path.isfile(self.folder / name):
+                check_image(self.folder / name)  # says what it is
             self.absent.append(f"{self.folder / (name + suffixes[0])} does not exist, but {named}")
         return found
 
@@ -85,12 +88,10 @@ class CaptureFiles:
         if entry.values.get(field) is None:
             return None
         name = self._text(entry, field)
-        if (found := self.find(name)) is None:
-            raise InputError(
-                f"{self.folder / name} does not exist, but {entry.where} names it as {field}; put it there, or remove "
-                "that field."
-            )
-        return self.folder / found
+        if found := self.find(name):
+            return self.folder / found
+        what = f"{self.folder / name} does not exist, but {entry.where} names it as {field}"
+        raise InputError(f"{what}; put it there, or remove that field.")
 
     def left_out(self, count: int, where: Path) -> list[str]:
         """Return the warning about absent images; none if all exist.
@@ -100,15 +101,11 @@ class CaptureFiles:
         """
         if not self.absent:
             return []
+        told = f"{len(self.absent)} of {count} images of {where} are absent"
         if len(self.absent) > MOST_ABSENT * count:
-            raise InputError(
-                f"{self.absent[0]}; {len(self.absent)} of {count} images are absent, and at most a fifth may be: put "
-                "them there, or remove what names them."
-            )
-        return [
-            f"{len(self.absent)} of {count} images of {where} are absent, and their frames are left out: "
-            f"{self.absent[0]}."
-        ]
+            advice = "put them there, or remove what names them"
+            raise InputError(f"{self.absent[0]}; {told}, and at most a fifth may be: {advice}.")
+        return [f"{told}, and their frames are left out: {self.absent[0]}."]
 
     def _text(self, entry: Fields, field: str) -> str:
         """Return a path whose file, if there is one, lies below the folder; symbolic links may lead out.
@@ -124,12 +121,6 @@ class CaptureFiles:
                 "name; put the file, or a link to it, into the folder, and name that."
             )
         return name
-
-    def _folded_entries(self, folder: Path) -> dict[str, str]:
-        if folder not in self._entries:
-            names = sorted(os.listdir(folder), reverse=True) if os.path.isdir(folder) else []
-            self._entries[folder] = {_folded(name): name for name in names}
-        return self._entries[folder]
 
 
 def _leads_out(name: str) -> bool:

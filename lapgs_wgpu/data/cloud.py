@@ -50,11 +50,7 @@ def find_cloud(folder: Path, patterns: Sequence[str]) -> Path | None:
 
 def read_cloud(path: Path) -> Cloud:
     """Read a .npy or a .ply file; points without colors are mid-gray. Raises InputError."""
-    colors = None
-    if path.suffix == ".npy":
-        points = read_npy(path)
-    else:
-        points, colors = read_points(path)
+    points, colors = (read_npy(path), None) if path.suffix == ".npy" else read_points(path)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
         raise InputError(f"{path} must hold at least one point of 3 numbers, an array of (N, 3), got {points.shape}.")
     points = points.astype(np.float64)  # float32 would round what lies far from the origin, before it is centered

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +11,7 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.data.images import encode_png
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.io.atomic import move
+from lapgs_wgpu.io.atomic import new_folder
 from lapgs_wgpu.splat.camera import Camera
 
 
@@ -44,7 +41,7 @@ def write_scene(
     """
     if _already_holds(folder, record, parameters):
         return folder
-    with _new_folder(folder) as unfinished:
+    with new_folder(folder) as unfinished:
         for split, (cameras, times) in splits.items():
             frames = []
             for index, (camera, time) in enumerate(zip(cameras, times, strict=True)):
@@ -68,25 +65,6 @@ def write_image(path: Path, image: NDArray[np.uint8]) -> None:
 
 def _write_json(path: Path, value: object) -> None:
     path.write_text(json.dumps(value, indent=1) + "\n")
-
-
-@contextmanager
-def _new_folder(folder: Path) -> Iterator[Path]:
-    """A folder to fill, which takes the name `folder` when the block ends without an exception.
-
-    `folder` must not exist, or be empty. Errors of the file system are raised as InputError.
-    """
-    unfinished = folder.with_name(f"{folder.name}.{os.getpid()}.partial")
-    try:
-        unfinished.mkdir(parents=True)
-        yield unfinished
-        if folder.is_dir():
-            folder.rmdir()  # it is empty
-        move(unfinished, folder)
-    except OSError as error:
-        raise InputError(f"{folder} cannot be written: {error}.") from None
-    finally:
-        shutil.rmtree(unfinished, ignore_errors=True)
 
 
 def _already_holds(folder: Path, record: str, parameters: Mapping[str, object]) -> bool:

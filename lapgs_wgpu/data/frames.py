@@ -20,10 +20,8 @@ from lapgs_wgpu.data.masks import MaskKind
 from lapgs_wgpu.data.normalize import Normalization
 from lapgs_wgpu.data.poses import place_of
 from lapgs_wgpu.data.stamps import ImageName
-from lapgs_wgpu.data.video_frames import VideoFrame
 
 Split = Literal["train", "val", "test"]
-ImageSource = ImageFile | VideoFrame
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +42,7 @@ class Frame:
     moving: the same of what moves, white.
     """
 
-    image: ImageSource
+    image: ImageFile
     lens: Lens
     T_cam_world: NDArray[np.float64]
     where: str

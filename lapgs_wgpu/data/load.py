@@ -7,9 +7,10 @@ file in `readers` and a line in READERS.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path, PurePath
-from typing import NamedTuple, get_args
+from typing import get_args
 
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import SUFFIXES, Pixels, Size, shrink, shrunk_size
@@ -18,9 +19,8 @@ from lapgs_wgpu.data.masks import MASKED, MOSTLY, Mask, MaskKind, check_masks, f
 from lapgs_wgpu.data.mover_cube import mover_cube
 from lapgs_wgpu.data.placement import place
 from lapgs_wgpu.data.readers import apps, colmap, hypernerf, panoptic, poses_bounds, transforms
-from lapgs_wgpu.data.split import held_out
 from lapgs_wgpu.data.stamps import natural_key
-from lapgs_wgpu.data.timestamps import as_one_camera, by_camera, disorder, in_step, read_times, to_unit_range
+from lapgs_wgpu.data.timestamps import as_one_camera, by_camera, disorder, held_out, in_step, read_times, to_unit_range
 from lapgs_wgpu.data.validation import check_cloud, check_film, check_frames, check_plausible, check_views, upright
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
@@ -72,45 +72,43 @@ def load_dataset(
     warnings = [*capture.warnings, *warnings, *check_plausible(frames)]
     frames, time_source = _timed(folder, dataclasses.replace(capture, frames=frames), warnings)
     check_frames(frames)
-    if masks is not None:
-        frames = _masked(Path(masks), frames)
+    frames = _masked(frames, None if masks is None else Path(masks), None if movers is None else folder / movers)
     warnings += _check_masks(frames)
-    if movers is not None:
-        found = find_masks(folder / movers, [frame.name.file for frame in frames], "each image, white where it moves")
-        warnings += check_masks(found, frames[0].image.size, "white", movers=True)
-        frames = [dataclasses.replace(frame, moving=found[frame.name.file]) for frame in frames]
 
     capture = dataclasses.replace(capture, frames=frames)
-    shots = _undistort(capture, shrunk_size(frames[0].image.size, image_size))
-    training = [shot for shot in shots if shot.frame.split == "train"]
-    training_cameras = list(dict.fromkeys(shot.camera for shot in training))
+    cameras, undistortions = _cameras(capture, shrunk_size(frames[0].image.size, image_size))
+    training = [(camera, frame) for camera, frame in zip(cameras, frames, strict=True) if frame.split == "train"]
+    training_cameras = list(dict.fromkeys(camera for camera, _ in training))
     if capture.cloud is not None:
         if capture.own_footage:
-            cameras, files = [shot.camera for shot in shots], [frame.name.file for frame in frames]
-            warnings += check_views(capture.cloud, cameras, files, capture.source)
+            warnings += check_views(capture.cloud, cameras, [frame.name.file for frame in frames], capture.source)
         cloud = check_cloud(capture.cloud, training_cameras, capture.source, warnings)
         capture = dataclasses.replace(capture, cloud=cloud)
     moving = None
     if movers is not None and capture.cloud is not None:
-        by_time = sorted(training, key=lambda shot: shot.frame.time or 0.0)
-        moving = mover_cube(capture.cloud, [(shot.camera, shot.moving) for shot in by_time])
-    placement = place(capture, [shot.frame for shot in training], training_cameras, normalize=normalize, moving=moving)
+        by_time = sorted(training, key=lambda pair: pair[1].time or 0.0)
+        seen = [(c, _view(frame, 0, c, undistortions[frame.lens]).moving) for c, frame in by_time]
+        moving = mover_cube(capture.cloud, [(camera, mask) for camera, mask in seen if mask is not None])
+    trained = [frame for _, frame in training]
+    placement = place(capture, trained, training_cameras, normalize=normalize, moving=moving)
     warnings += placement.warnings
-    summary = _summary(reader.name, capture, shots, time_source)
-    if capture.own_footage:
-        shots = _by_film(shots, warnings)
+    summary = _summary(reader.name, capture, cameras, time_source)
 
     fit = placement.normalization
     whole = fit if fit is None or capture.moved is None else capture.moved.then(fit)
-    placed = {camera: camera if fit is None else fit.camera(camera) for camera in {shot.camera for shot in shots}}
+    placed = {camera: camera if fit is None else fit.camera(camera) for camera in set(cameras)}
     # Without a cloud, what stands just before one camera would explain its images alone, and block those beside it.
     if placement.depths is not None and placement.cloud is None:
         near = NEAR_SHARE * placement.depths[0]
         placed = {camera: dataclasses.replace(seen, near=near) for camera, seen in placed.items()}
+    order = _by_film(frames, warnings) if capture.own_footage else range(len(frames))
 
     def views(split: Split) -> tuple[View, ...]:
-        chosen = [shot for shot in shots if shot.frame.split == split]
-        return tuple(shot.view(number, placed[shot.camera]) for number, shot in enumerate(chosen))
+        chosen = [i for i in order if frames[i].split == split]
+        return tuple(
+            _view(frames[i], number, placed[cameras[i]], undistortions[frames[i].lens])
+            for number, i in enumerate(chosen)
+        )
 
     return Dataset(
         folder.resolve().name,
@@ -130,23 +128,23 @@ def load_dataset(
     )
 
 
-def _summary(layout: str, capture: Capture, shots: Sequence[_Shot], time_source: str) -> str:
+def _summary(layout: str, capture: Capture, cameras: Sequence[Camera], time_source: str) -> str:
     """Say how a capture was understood: layout, cameras, times and their source, what is held out."""
     films = by_camera([frame.name for frame in capture.frames])
     folders = len({PurePath(frame.name.file).parent for frame in capture.frames})
     held = [frame.name.camera for frame in capture.frames if frame.split != "train"]
-    places = len({shot.camera for shot in shots})
-    still = len(shots) >= 2 * places
+    places = len(set(cameras))
+    still = len(cameras) >= 2 * places
     number = places if still else len(films)
-    cameras = f"{number} {'still' if still else 'moving'} camera{'s' * (number > 1)}"
+    told = f"{number} {'still' if still else 'moving'} camera{'s' * (number > 1)}"
     if not still and capture.own_footage and len(films) > 1:
-        cameras += " that film at the same time"
+        told += " that film at the same time"
     elif not still and capture.own_footage and folders > 1:
-        cameras += f" in {folders} folders, one after the other"
+        told += f" in {folders} folders, one after the other"
     whole = len(films) > 1 and len(set(held)) == 1 and len(films[held[0]]) == len(held)
-    out = f"{held[0]} is" if whole else f"{len(held)} of {len(shots)} images are"
+    out = f"{held[0]} is" if whole else f"{len(held)} of {len(cameras)} images are"
     times = len({frame.time for frame in capture.frames})
-    return f"{layout}, {cameras}, {times} times from {time_source}; {out} held out"
+    return f"{layout}, {told}, {times} times from {time_source}; {out} held out"
 
 
 def _reader(folder: Path) -> Reader:
@@ -182,7 +180,7 @@ def _timed(folder: Path, capture: Capture, warnings: list[str]) -> tuple[list[Fr
     names = [frame.name for frame in capture.frames]
     times, source = [frame.time for frame in capture.frames if frame.time is not None], capture.time_source
     if not times:
-        times, source = read_times(names, folder, warnings)
+        times, source = read_times(names, folder)
     if capture.own_footage:
         names = as_one_camera(names, times, [frame.place for frame in capture.frames])
         warnings += disorder(names, times, numbered=source.startswith("the frame numbers"))
@@ -198,83 +196,41 @@ def _timed(folder: Path, capture: Capture, warnings: list[str]) -> tuple[list[Fr
     return [dataclasses.replace(f, name=name, time=time, split=split) for f, name, time, split in found], source
 
 
-def _masked(folder: Path, frames: Sequence[Frame]) -> list[Frame]:
-    """Give training frames the masks in the user's folder, in place of those that the capture names."""
-    names = [frame.name.file for frame in frames if frame.split == "train"]
-    masks = find_masks(folder, names, "each training image, named as the image")
-    return [
-        dataclasses.replace(frame, mask=masks[frame.name.file], mask_kind="white") if frame.split == "train" else frame
-        for frame in frames
-    ]
+def _masked(frames: Sequence[Frame], masks: Path | None, movers: Path | None) -> list[Frame]:
+    """Give training frames the masks in the user's folder, in place of those that the capture names, and all frames
+    those of what moves."""
+    out = list(frames)
+    if masks is not None:
+        names = [frame.name.file for frame in frames if frame.split == "train"]
+        found = find_masks(masks, names, "each training image, named as the image")
+        out = [
+            dataclasses.replace(f, mask=found[f.name.file], mask_kind="white") if f.split == "train" else f for f in out
+        ]
+    if movers is not None:
+        found = find_masks(movers, [frame.name.file for frame in frames], "each image, white where it moves")
+        out = [dataclasses.replace(frame, moving=found[frame.name.file]) for frame in out]
+    return out
 
 
 def _check_masks(frames: Sequence[Frame]) -> list[str]:
-    warnings = []
+    size, warnings = frames[0].image.size, list[str]()
     for kind in get_args(MaskKind):
         of_kind = [frame for frame in frames if frame.mask_kind == kind and frame.split == MASKED[kind]]
-        masks = {frame.name.file: frame.mask for frame in of_kind if frame.mask is not None}
-        warnings += check_masks(masks, frames[0].image.size, kind)
-    return warnings
+        warnings += check_masks({f.name.file: f.mask for f in of_kind if f.mask is not None}, size, kind)
+    moving = {frame.name.file: frame.moving for frame in frames if frame.moving is not None}
+    return warnings + check_masks(moving, size, "white", movers=True)
 
 
-class _Shot(NamedTuple):
-    """A frame, its pinhole camera, and what makes the camera's image of the file's.
-
-    undistortion: at the file's size; None for a pinhole.
-    """
-
-    frame: Frame
-    camera: Camera
-    undistortion: Undistortion | None
-
-    @property
-    def size(self) -> Size:
-        return self.camera.width, self.camera.height
-
-    def pixels(self) -> Pixels:
-        """Decode, undistort and shrink the image. Raises InputError."""
-        image = self.frame.image
-        if self.undistortion is None:
-            return image.read(self.size)
-        return shrink(self.undistortion.apply(image.read(image.size)), self.size)
-
-    def mask(self) -> Mask:
-        """Decode, undistort and shrink the mask. Raises InputError."""
-        assert self.frame.mask is not None
-        return read_mask(self.frame.mask, self.frame.mask_kind, self.undistortion, self.frame.image.size, self.size)
-
-    def moving(self) -> Mask:
-        """Decode, undistort and shrink the mask of what moves. Raises InputError."""
-        assert self.frame.moving is not None
-        stored = self.frame.image.size
-        return read_mask(self.frame.moving, "white", self.undistortion, stored, self.size, MOSTLY)
-
-    def view(self, number: int, camera: Camera) -> View:
-        """Make the view. number: within its split, for its name. camera: in the world's coordinates."""
-        frame = self.frame
-        assert frame.time is not None
-        mask = self.mask if frame.mask is not None and frame.split == MASKED[frame.mask_kind] else None
-        return View(
-            name=f"{frame.split}_{frame.label or f'{number:05d}'}",
-            camera=camera,
-            time=frame.time,
-            source=str(frame.image),
-            pixels=self.pixels,
-            mask=mask if frame.split == "test" else None,
-            ignored=mask if frame.split == "train" else None,
-            moving=None if frame.moving is None else self.moving,
-        )
-
-
-def _undistort(capture: Capture, size: Size) -> list[_Shot]:
-    """Give each frame its pinhole camera for images of `size`, (width, height). Raises InputError.
+def _cameras(capture: Capture, size: Size) -> tuple[list[Camera], dict[Lens, Undistortion | None]]:
+    """Return the pinhole camera of each frame for images of `size`, (width, height), and how the images of each lens
+    are undistorted at their own size; None for a pinhole. Raises InputError.
 
     Frames of equal lens and pose share the camera if the capture says so.
     """
     stored = capture.frames[0].image.size
     undistortions: dict[Lens, Undistortion | None] = {}
-    cameras: dict[tuple[Lens, bytes] | int, Camera] = {}
-    shots = []
+    made: dict[tuple[Lens, bytes] | int, Camera] = {}
+    cameras = []
     for index, frame in enumerate(capture.frames):
         lens = frame.lens
         if lens not in undistortions:
@@ -282,18 +238,44 @@ def _undistort(capture: Capture, size: Size) -> list[_Shot]:
             undistortions[lens] = None if lens.is_pinhole else Undistortion(resized, resized.pinhole(frame.where))
         undistortion = undistortions[lens]
         key = (lens, frame.T_cam_world.tobytes()) if capture.shares_cameras else index
-        if key not in cameras:
+        if key not in made:
             K, taken = (lens.K, (lens.width, lens.height)) if undistortion is None else (undistortion.K, stored)
-            cameras[key] = Camera(K, frame.T_cam_world, *taken).resized(*size)
-        shots.append(_Shot(frame, cameras[key], undistortion))
-    return shots
+            made[key] = Camera(K, frame.T_cam_world, *taken).resized(*size)
+        cameras.append(made[key])
+    return cameras, undistortions
 
 
-def _by_film(shots: Sequence[_Shot], warnings: list[str]) -> list[_Shot]:
-    """Return the shots by camera, then time. Appends warnings about blurred and repeated images of each camera."""
-    ordered = []
-    for mine in by_camera([shot.frame.name for shot in shots]).values():
-        film = sorted((shots[i] for i in mine), key=lambda shot: (shot.frame.time, natural_key(shot.frame.name.file)))
-        warnings += check_film([Path(str(shot.frame.image)) for shot in film])
+def _view(frame: Frame, number: int, camera: Camera, undistortion: Undistortion | None) -> View:
+    """Make the view of a frame. number: within its split, for its name. camera: in the world's coordinates."""
+    assert frame.time is not None
+    stored, size = frame.image.size, (camera.width, camera.height)
+
+    def pixels() -> Pixels:
+        if undistortion is None:
+            return frame.image.read(size)
+        return shrink(undistortion.apply(frame.image.read(stored)), size)
+
+    def mask(path: Path | None, kind: MaskKind, above: int = 0) -> Callable[[], Mask] | None:
+        return None if path is None else partial(read_mask, path, kind, undistortion, stored, size, above)
+
+    used = mask(frame.mask, frame.mask_kind) if frame.split == MASKED[frame.mask_kind] else None
+    return View(
+        name=f"{frame.split}_{frame.label or f'{number:05d}'}",
+        camera=camera,
+        time=frame.time,
+        source=str(frame.image),
+        pixels=pixels,
+        mask=used if frame.split == "test" else None,
+        ignored=used if frame.split == "train" else None,
+        moving=mask(frame.moving, "white", MOSTLY),
+    )
+
+
+def _by_film(frames: Sequence[Frame], warnings: list[str]) -> list[int]:
+    """Return the indices of frames by camera, then time. Appends warnings about blurred and repeated images."""
+    ordered = list[int]()
+    for mine in by_camera([frame.name for frame in frames]).values():
+        film = sorted(mine, key=lambda i: (frames[i].time, natural_key(frames[i].name.file)))
+        warnings += check_film([frames[i].image.path for i in film])
         ordered += film
     return ordered

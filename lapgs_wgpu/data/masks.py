@@ -44,10 +44,8 @@ def find_masks(folder: Path, names: Iterable[str], what: str) -> dict[str, Path]
     check_mask_folder(folder, what)
     masks, missing = _found(folder, names)
     if missing:
-        raise InputError(
-            f"{folder} lacks {len(missing)} of {len(missing) + len(masks)} masks, such as that of {missing[0]}; add a "
-            f"PNG for {what}."
-        )
+        count = f"{len(missing)} of {len(missing) + len(masks)}"
+        raise InputError(f"{folder} lacks {count} masks, such as that of {missing[0]}; add a PNG for {what}.")
     return masks
 
 
@@ -71,14 +69,10 @@ def find_covisible(folders: Sequence[Path], names: Sequence[str]) -> dict[str, P
 def _found(folder: Path, names: Iterable[str]) -> tuple[dict[str, Path], list[str]]:
     """The masks below a folder by image, and the images without. Names may differ as in `CaptureFiles.find`."""
     files = CaptureFiles(folder)
-    masks, missing = dict[str, Path](), list[str]()
-    for name in names:
-        found = files.find(f"{name}.png") or files.find(str(PurePosixPath(name).with_suffix(".png")))
-        if found is None:
-            missing.append(name)
-        else:
-            masks[name] = folder / found
-    return masks, missing
+    found = {
+        name: files.find(f"{name}.png") or files.find(str(PurePosixPath(name).with_suffix(".png"))) for name in names
+    }
+    return {name: folder / file for name, file in found.items() if file}, [name for name in found if not found[name]]
 
 
 def check_mask_size(path: Path, size: Size) -> None:
@@ -99,34 +93,29 @@ def check_masks(masks: Mapping[str, Path], size: Size, kind: MaskKind, *, movers
     """
     for path in masks.values():
         check_mask_size(path, size)
-    checked = list(masks.values()) if kind == "measured" else evenly(list(masks.values()), CHECKED)
-    levels = [_levels(decode(path)) for path in checked]
-    out = [_taken_out(level, kind) for level in levels]
     if kind == "measured":
-        empty = next((path for path, pixels in zip(checked, out, strict=True) if pixels.all()), None)
-        if empty is not None:
-            raise InputError(
-                f"{empty} has no white pixel ({MEASURED}), which leaves nothing to measure; make it again, or remove "
-                "the masks of all test images."
-            )
+        for path in masks.values():
+            if _levels(decode(path)).max() < MEASURED:
+                raise InputError(
+                    f"{path} has no white pixel ({MEASURED}), which leaves nothing to measure; make it again, or "
+                    "remove the masks of all test images."
+                )
         return []
-    if not levels or (any(pixels.any() for pixels in out) and not all(pixels.all() for pixels in out)):
+    checked = evenly(list(masks.values()), CHECKED)
+    levels = [_levels(decode(path)) for path in checked]
+    shares = [_taken_out(level, kind).mean() for level in levels]
+    if not shares or (max(shares) > 0 and min(shares) < 1):
         return []
-    looked_at = f"in {len(levels)} of {len(masks)} that were looked at, such as {checked[0]}"
     color = f"{'black (a level below' if kind == 'black' else 'white (a level of at least'} {WHITE} of 255)"
-    range_ = f"their levels are {min(level.min() for level in levels)} to {max(level.max() for level in levels)}"
-    if movers and any(pixels.any() for pixels in out):
-        raise InputError(
-            f"everything moves by the masks: {looked_at}, every pixel is {color}; {range_}: invert them, or leave them "
-            "out (data.movers)."
-        )
-    if movers:
-        return [f"nothing moves by the masks: {looked_at}, no pixel is {color}; {range_}."]
-    if not any(pixels.any() for pixels in out):
-        return [f"the masks leave out nothing: {looked_at}, no pixel is {color}; {range_}."]
+    looked_at = (
+        f"in {len(levels)} of {len(masks)} that were looked at, such as {checked[0]}, {{}} pixel is {color}; their "
+        f"levels are {min(level.min() for level in levels)} to {max(level.max() for level in levels)}"
+    )
+    what = "moves by the masks" if movers else "is left out by the masks"
+    if max(shares) == 0:
+        return [f"nothing {what}: {looked_at.format('no')}."]
     raise InputError(
-        f"the masks leave out everything: {looked_at}, every pixel is {color}, which does not count in the training; "
-        f"{range_}: write them as 0 and 255, invert them, or leave them out."
+        f"everything {what}: {looked_at.format('every')}: write them as 0 and 255, invert them, or leave them out."
     )
 
 

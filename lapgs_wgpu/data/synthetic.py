@@ -31,7 +31,6 @@ from lapgs_wgpu.data.raytrace import (
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
-FREQUENCIES = (1.0, 2.0, 3.5, 0.5)  # cycles over the clip, of the toys in their order
 CAMERA_ANGLE_X = 0.6911112070083618  # horizontal field of view in radians, that of D-NeRF's scenes
 CAMERA_RADIUS = 4.0
 CAMERA_HEIGHT = (0.3, 0.9)  # range of the sine of the camera's elevation
@@ -45,11 +44,11 @@ TABLE_HEIGHT, TABLE_RADIUS = -0.6, 1.15
 class Toy:
     """A moving thing. Its centre is at `centre + cosine cos(2 pi f t) + sine sin(2 pi f t)`.
 
-    radius: of the ball; half the edge of the box. turns: whether it also turns about z, f turns over the clip.
-    colors: the two between which its pattern alternates. All in world units, RGB in [0, 1].
+    cycles: f, over the clip. radius: of the ball; half the edge of the box. turns: whether it also turns about z, f
+    turns over the clip. colors: the two between which its pattern alternates. All in world units, RGB in [0, 1].
     """
 
-    name: str
+    cycles: float
     shape: Literal["beach ball", "ringed ball", "box"]
     radius: float
     centre: Vector
@@ -62,40 +61,35 @@ class Toy:
     def solid(self) -> Solid:
         return Solid(self.shape, (self.radius,) * 3, self.colors)
 
+    def path(self, times: ArrayLike) -> Floats:
+        """Where its centre is: (T, 3) in world units, for times (T,) in [0, 1]."""
+        angle = self.cycles * (2 * np.pi * np.asarray(times, dtype=np.float64)[:, None])
+        return np.asarray(np.array(self.centre) + np.cos(angle) * self.cosine + np.sin(angle) * self.sine)
+
 
 # Each moves by about its own radius, so that the mean over time still shows it: a model that first fits a still scene
 # has something to set in motion. Rings run along the fast motion, where segments would alias.
 # fmt: off
 TOYS = (
-    Toy("orbiter", "beach ball", 0.40, (0.1, 0.05, 0.55), (0.36, 0, 0), (0, 0.36, 0),
+    Toy(1.0, "beach ball", 0.40, (0.1, 0.05, 0.55), (0.36, 0, 0), (0, 0.36, 0),
         ((0.92, 0.38, 0.27), (0.98, 0.93, 0.82))),
-    Toy("bouncer", "beach ball", 0.34, (-0.75, -0.45, 0.12), (0, 0, 0), (0, 0, -0.36),
+    Toy(2.0, "beach ball", 0.34, (-0.75, -0.45, 0.12), (0, 0, 0), (0, 0, -0.36),
         ((0.13, 0.58, 0.55), (0.93, 0.77, 0.33))),
-    Toy("shuttle", "ringed ball", 0.33, (0.66, -0.2, -0.23), (0, 0.3, 0), (0, 0, 0),
+    Toy(3.5, "ringed ball", 0.33, (0.66, -0.2, -0.23), (0, 0.3, 0), (0, 0, 0),
         ((0.30, 0.36, 0.78), (0.95, 0.62, 0.75))),
-    Toy("spinner", "box", 0.29, (-0.2, 0.62, -0.29), (0, 0, 0), (0, 0, 0),
+    Toy(0.5, "box", 0.29, (-0.2, 0.62, -0.29), (0, 0, 0), (0, 0, 0),
         ((0.55, 0.27, 0.62), (0.62, 0.80, 0.32)), turns=True),
 )
 # fmt: on
 
 
-def trajectories(times: ArrayLike, frequencies: Sequence[float] = FREQUENCIES) -> dict[str, Floats]:
-    """Where the toys' centres are: name -> (T, 3) in world units, for times (T,) in [0, 1]."""
-    phase = 2 * np.pi * np.asarray(times, dtype=np.float64)[:, None]
-    return {
-        toy.name: np.array(toy.centre) + np.cos(f * phase) * toy.cosine + np.sin(f * phase) * toy.sine
-        for toy, f in zip(TOYS, frequencies, strict=False)
-    }
-
-
-def render(camera: Camera, time: float, frequencies: Sequence[float] = FREQUENCIES) -> NDArray[np.uint8]:
+def render(camera: Camera, time: float, toys: Sequence[Toy] = TOYS) -> NDArray[np.uint8]:
     """Ray trace one picture: (H, W, 4) straight RGBA."""
     rays = pixel_rays(camera)
-    centres = trajectories([time], frequencies)
     surfaces = []
-    for toy, f in zip(TOYS, frequencies, strict=False):
-        angle = 2 * np.pi * f * time if toy.turns else 0.0
-        surfaces.append(solid_hits(toy.solid, centres[toy.name][0], camera.position, rays, angle=angle))
+    for toy in toys:
+        angle = 2 * np.pi * toy.cycles * time if toy.turns else 0.0
+        surfaces.append(solid_hits(toy.solid, toy.path([time])[0], camera.position, rays, angle=angle))
     surfaces.append(plane_hits(2, TABLE_HEIGHT, 1, _table, camera.position, rays))
     color, owner = combine(surfaces, rays.shape[1])
     return to_pixels(color, owner >= 0, camera)
@@ -141,39 +135,27 @@ def write_synthetic(
     size: int = 128,
     train_views: int = 100,
     test_views: int = 20,
-    seed: int = 0,
-    frequencies: Sequence[float] = FREQUENCIES,
 ) -> Path:
     """Write the scene as D-NeRF does: transforms_{train,val,test}.json and size x size RGBA PNGs. Returns the folder.
 
     train_views: spread evenly over the clip, the camera of each elsewhere. test_views: halfway between training times,
-    from cameras of their own; as many again for validation. seed: of the cameras.
-    frequencies: cycles over the clip of the first toys; there are as many toys as frequencies, at most 4.
+    from cameras of their own; as many again for validation.
     The same arguments give the same bytes. A folder that already holds this very scene is left as it is, and one that
     holds anything else is refused with InputError. The folder appears only when it is whole.
     """
-    if size < 1 or train_views < 2 or test_views < 1 or seed < 0:
+    if size < 1 or train_views < 2 or test_views < 1:
         raise InputError(
-            "the built-in scene needs a size of at least 1, 2 training views, 1 test view and a seed from 0 up, "
-            f"got {size}, {train_views}, {test_views} and {seed}."
+            "the built-in scene needs a size of at least 1, 2 training views and 1 test view, "
+            f"got {size}, {train_views} and {test_views}."
         )
-    if not 1 <= len(frequencies) <= len(TOYS) or not all(math.isfinite(f) and f >= 0 for f in frequencies):
-        raise InputError(f"the built-in scene needs 1 to {len(TOYS)} frequencies from 0 up, got {list(frequencies)}.")
-    parameters = {
-        "version": VERSION,
-        "size": size,
-        "train_views": train_views,
-        "test_views": test_views,
-        "seed": seed,
-        "frequencies": [float(f) for f in frequencies],
-    }
+    parameters = {"version": VERSION, "size": size, "train_views": train_views, "test_views": test_views}
     train, test = split_times(train_views, test_views)
     splits = {
-        split: (cameras(len(times), 3 * seed + index, size=size), times)
+        split: (cameras(len(times), index, size=size), times)
         for index, (split, times) in enumerate((("train", train), ("val", test), ("test", test)))
     }
 
     def write_frame(unfinished: Path, split: str, name: str, camera: Camera, time: float) -> None:
-        write_image(unfinished / split / f"{name}.png", render(camera, time, frequencies))
+        write_image(unfinished / split / f"{name}.png", render(camera, time))
 
     return write_scene(Path(folder), RECORD, parameters, splits, CAMERA_ANGLE_X, write_frame)

@@ -1,10 +1,11 @@
-"""Timestamps of own footage: from times.json or from the names of images (docs/own-data.md)."""
+"""Timestamps of own footage, from times.json or from the names of images, and what is held out (docs/own-data.md)."""
 
 from __future__ import annotations
 
 import json
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 
@@ -17,15 +18,17 @@ from lapgs_wgpu.errors import InputError
 
 TIMES = "times.json"
 APART = 0.05  # of the clip: cameras that begin or end further apart may have other rates or clocks
+EVERY = 8  # one of so many times is tested: the fifth, the thirteenth, ...
+FIRST = 4
+CAMERAS = 3  # with so many cameras or more, the first camera is held out instead
 IN_STEP = 0.1  # of the time from an image of a camera to its next: less than films are off beside each other
-FEW = 5  # images of a camera, from which on a multiple of them tells another rate
 
 
-def read_times(names: Sequence[ImageName], folder: Path, warnings: list[str]) -> tuple[list[float], str]:
+def read_times(names: Sequence[ImageName], folder: Path) -> tuple[list[float], str]:
     """Read the time of each image, in any unit, and name the source of the times for errors.
 
     The source is times.json in the folder, if it exists, else clock times, seconds or frame numbers in the names.
-    Appends warnings about cameras of another rate. Raises InputError.
+    Raises InputError.
     """
     path = folder / TIMES
     if path.is_file():
@@ -34,8 +37,7 @@ def read_times(names: Sequence[ImageName], folder: Path, warnings: list[str]) ->
     if clocks := clock_times(names):
         times, kind = clocks
         return times, f"the {kind} in {whose}"
-    numbers = frame_numbers(names)
-    return _at_one_rate(names, numbers, warnings), f"the frame numbers in {whose}"
+    return [float(number) for number in frame_numbers(names)], f"the frame numbers in {whose}"
 
 
 def to_unit_range(values: Sequence[float], first: float, last: float) -> list[float]:
@@ -146,87 +148,70 @@ def frame_numbers(names: Sequence[ImageName]) -> list[int]:
     return [number_of[i] for i in range(len(names))]
 
 
-def _at_one_rate(names: Sequence[ImageName], numbers: Sequence[int], warnings: list[str]) -> list[float]:
-    """Times of frame numbers, in those of the slowest camera: one with twice as many images films at twice the rate.
-
-    This holds where all cameras begin at one number and have exact multiples of as many images. Appends a warning.
-    """
-    cameras = by_camera(names)
-    spans = {camera: sorted(numbers[i] for i in mine) for camera, mine in cameras.items()}
-    least = min(map(len, spans.values()))
-    first = min(span[0] for span in spans.values())
-    if (
-        least < FEW
-        or len(set(map(len, spans.values()))) == 1
-        or any(len(span) % least or span != list(range(first, first + len(span))) for span in spans.values())
-    ):
-        return [float(number) for number in numbers]
-    rates = {camera: len(span) // least for camera, span in spans.items()}
-    warnings += _ends({camera: (float(span[0]), float(span[-1])) for camera, span in spans.items()}, 1.0, "")
-    faster = [f"{camera} has {rate} times as many images" for camera, rate in rates.items() if rate > 1]
-    warnings.append(
-        f"cameras have other rates: {', '.join(faster)} as the slowest, and is taken to film as many times as fast, "
-        f"over the same time; if it filmed longer, write the times in seconds into {TIMES}."
-    )
-    return [first + (number - first) / rates[name.camera] for name, number in zip(names, numbers, strict=True)]
-
-
 def disorder(names: Sequence[ImageName], times: Sequence[float], *, numbered: bool) -> list[str]:
-    """Warn about cameras whose times decrease with the frame number, and about cameras without a common time.
+    """Warn about cameras whose times decrease with the frame number, and about cameras that do not film together.
 
     numbered: whether the times are frame numbers.
     """
     warnings = []
-    spans: dict[str, tuple[float, float]] = {}
-    for camera, mine in by_camera(names).items():
+    cameras = by_camera(names)
+    for mine in cameras.values():
         own = [names[i] for i in mine]
-        spans[camera] = min(times[i] for i in mine), max(times[i] for i in mine)
-        if clock_times(own):
-            continue  # their numbers are no frame numbers
-        try:
-            numbers = frame_numbers(own)
-        except InputError:
-            continue  # names without a frame number have no order
-        ordered = [i for _, i in sorted(zip(numbers, mine, strict=True))]
-        back = [(a, b) for a, b in pairwise(ordered) if times[b] < times[a]]
-        if back:
-            first, second = back[0]
-            warnings.append(
-                f"frames are out of order: time goes back {len(back)} times in {len(ordered)} images, first from "
-                f"{names[first].file} at {times[first]:g} to "
-                f"{names[second].file} at {times[second]:g}; correct the times, or the numbers."
-            )
+        if numbered or clock_times(own):
+            continue
+        with suppress(InputError):  # names without a frame number have no order
+            ordered = [i for _, i in sorted(zip(frame_numbers(own), mine, strict=True))]
+            back = [(a, b) for a, b in pairwise(ordered) if times[b] < times[a]]
+            if back:
+                first, second = back[0]
+                warnings.append(
+                    f"frames are out of order: time goes back {len(back)} times in {len(ordered)} images, first from "
+                    f"{names[first].file} at {times[first]:g} to {names[second].file} at {times[second]:g}; correct "
+                    "the times, or the numbers."
+                )
+    spans = {camera: (min(times[i] for i in mine), max(times[i] for i in mine)) for camera, mine in cameras.items()}
+    (first_camera, (a, b)), *others = spans.items()
+    for other, (c, d) in others:
+        if c > b or d < a:
+            return [
+                *warnings,
+                f"cameras film at different times: {first_camera} from {a:g} to {b:g} and {other} from {c:g} to {d:g}; "
+                "if they filmed together, give their times, or numbers, from a common moment on.",
+            ]
+    step = max(time_step(np.unique([times[i] for i in mine])) for mine in cameras.values())
+    longest = max(1.5 * step, APART * (max(times) - min(times)))
     advice = f"; if some film more images a second, or were started apart, write the times in seconds into {TIMES}"
-    slowest = max(time_step(np.unique([times[i] for i in mine])) for mine in by_camera(names).values())
-    return warnings + _ends(spans, slowest, advice if numbered else "")
-
-
-def _ends(spans: dict[str, tuple[float, float]], step: float, advice: str) -> list[str]:
-    """Warn about cameras without a common time, else about those that do not begin and end together."""
-    warnings = []
-    first_camera, *further = spans
-    a, b = spans[first_camera]
-    disjoint = [camera for camera in further if spans[camera][0] > b or spans[camera][1] < a]
-    if disjoint:
-        other = disjoint[0]
-        c, d = spans[other]
-        return [
-            f"cameras film at different times: {first_camera} from {a:g} to {b:g} and {other} from {c:g} to {d:g}; "
-            "if they filmed together, give their times, or numbers, from a common moment on."
-        ]
-    for word, ends in (("begin", [low for low, _ in spans.values()]), ("end", [high for _, high in spans.values()])):
-        length = max(high for _, high in spans.values()) - min(low for low, _ in spans.values())
-        if max(ends) - min(ends) > max(1.5 * step, APART * length):
+    for word, ends in zip(("begin", "end"), zip(*spans.values(), strict=True), strict=True):
+        if max(ends) - min(ends) > longest:
             at: dict[float, list[str]] = {}
             for camera, end in zip(spans, ends, strict=True):
                 at.setdefault(end, []).append(camera)
-            told = ", ".join(
-                f"{', '.join(cameras[:4])}{' ...' * (len(cameras) > 4)} at {end:g}" for end, cameras in at.items()
-            )
-            warnings.append(f"cameras {word} at different times: {told}{advice}.")
+            told = (f"{', '.join(some[:4])}{' ...' * (len(some) > 4)} at {end:g}" for end, some in at.items())
+            warnings.append(f"cameras {word} at different times: {', '.join(told)}{advice if numbered else ''}.")
     return warnings
 
 
 def write_times(folder: Path, times: dict[str, float]) -> None:
     """Write times.json. times: of each image in seconds, by its path below images/."""
     (folder / TIMES).write_text(json.dumps(times, indent=0) + "\n", encoding="utf-8")
+
+
+def held_out(names: Sequence[ImageName], times: Sequence[float]) -> set[int]:
+    """Return the indices of the test images.
+
+    These are the images of the first camera, if there are three or more cameras; else those of every eighth time, from
+    the fifth on. Raises InputError if there are too few.
+    """
+    cameras = sorted({name.camera for name in names}, key=natural_key)
+    if len(cameras) >= CAMERAS:
+        return {i for i, name in enumerate(names) if name.camera == cameras[0]}
+    distinct = sorted(set(times))
+    moments = times if len(distinct) > 1 else range(len(names))  # of equal times, each image counts as one of its own
+    tested = set(sorted(set(moments))[FIRST::EVERY])
+    chosen = {i for i, moment in enumerate(moments) if moment in tested}
+    if not chosen:
+        raise InputError(
+            f"{len(names)} images at {len(distinct)} times are too few: every eighth time from the fifth on is held "
+            "out for testing, so at least 5 are needed, or 3 cameras, of which the first is held out."
+        )
+    return chosen

@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -23,8 +22,8 @@ from lapgs_wgpu.data.images import ImageFile, Size, decode, gray_thumbnail, size
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.placement import near_focus
 from lapgs_wgpu.data.poses import AXES_HINT
-from lapgs_wgpu.data.thumbnails import BLURRED, EQUAL, THUMBNAIL, blurred, repeats, sharpness, sharpness_around
-from lapgs_wgpu.data.views import Dataset
+from lapgs_wgpu.data.thumbnails import BLURRED, EQUAL, THUMBNAIL, blurred, repeats, sharpness
+from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
@@ -46,7 +45,7 @@ def upright(frames: Sequence[Frame]) -> tuple[list[Frame], list[str]]:
     turned, unclear = [], []
     for frame in frames:
         image = frame.image
-        if isinstance(image, ImageFile) and image.orientation > 1:
+        if image.orientation > 1:
             stored, shown = (_fits(size, frame.lens) for size in (image.size, image.turned.size))
             if shown and not stored:
                 frame = dataclasses.replace(frame, image=image.turned)
@@ -74,7 +73,7 @@ def check_plausible(frames: Sequence[Frame]) -> list[str]:
             f"{lens.width}x{lens.height}, in {len(off)} cameras; unless the images were cut out of larger ones, the "
             "intrinsics are those of another size, or in other units than pixels."
         )
-    images = [frame.image for frame in frames if isinstance(frame.image, ImageFile)]
+    images = [frame.image for frame in frames]
     deep, transparent = [image for image in images if image.deep], [image for image in images if image.alpha]
     if told := _low_levels(deep, slice(3), "images of 16 bits are nearly black", "level"):
         text, highest = told
@@ -189,18 +188,15 @@ def check_times(dataset: Dataset, *, moving: bool) -> list[str]:
         )
     else:
         warnings += _gaps(dataset, source)
-    first: dict[tuple[bytes, bytes, float], str] = {}
-    repeated = []
-    for view in dataset.train:
-        camera = view.camera
-        before = first.setdefault((camera.K.tobytes(), camera.T_cam_world.tobytes(), view.time), view.name)
-        if before != view.name:
-            repeated.append((before, view))
+    first: dict[tuple[bytes, bytes, float], View] = {}
+    keys = [(view.camera.K.tobytes(), view.camera.T_cam_world.tobytes(), view.time) for view in dataset.train]
+    pairs = [(first.setdefault(key, view), view) for key, view in zip(keys, dataset.train, strict=True)]
+    repeated = [(before, view) for before, view in pairs if before is not view]
     if repeated:
         before, view = repeated[0]
         warnings.append(
             f"{source}: {len(repeated)} of {count} training images repeat the time of another image of the same "
-            f"camera, such as {view.name} and {before} at {view.time:g}; the training averages them, so give each "
+            f"camera, such as {view.name} and {before.name} at {view.time:g}; the training averages them, so give each "
             "image its own time, or remove it."
         )
     return warnings
@@ -208,15 +204,12 @@ def check_times(dataset: Dataset, *, moving: bool) -> list[str]:
 
 def _gaps(dataset: Dataset, source: str) -> list[str]:
     """Warn about the longest part of the clip [0, 1] without a training view."""
-    times = dataset.times
-    edges = np.concatenate([[0.0], times, [1.0]])
-    gaps = np.diff(edges)
-    usual = float(np.median(np.diff(times)))
-    wide = np.flatnonzero((gaps > GAP) & (gaps > GAP_FACTOR * usual))
-    if not len(wide):
+    edges = np.concatenate([[0.0], dataset.times, [1.0]])
+    gaps, usual = np.diff(edges), float(np.median(np.diff(dataset.times)))
+    longest = int(np.argmax(gaps))
+    if gaps[longest] <= max(GAP, GAP_FACTOR * usual):
         return []
-    longest = wide[np.argmax(gaps[wide])]
-    low, high = edges[longest], edges[longest + 1]
+    low, high = edges[longest : longest + 2]
     tested = sum(low < view.time < high for view in dataset.test)
     return [
         f"{source}: no training image has a time between {low:.4g} and {high:.4g}, though the usual step is "
@@ -226,14 +219,11 @@ def _gaps(dataset: Dataset, source: str) -> list[str]:
 
 
 def check_in_view(dataset: Dataset, points: NDArray[np.floating]) -> list[str]:
-    """Warn about the longest span of time in which no training view shows the scene.
+    """Warn about times at which no training view shows the scene.
 
     points: (N, 3) means of the initial Gaussians, world units. Raises InputError if no view shows any.
     """
     seen = {camera: bool(in_view(points, camera)[1].any()) for camera in dataset.cameras}
-    blind: dict[float, bool] = {}  # time -> whether no view of that time shows the scene
-    for view in dataset.train:
-        blind[view.time] = blind.get(view.time, True) and not seen[view.camera]
     if not any(seen.values()):
         low, high = points.min(axis=0), points.max(axis=0)
         box = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(low, high, strict=True))
@@ -241,15 +231,14 @@ def check_in_view(dataset: Dataset, points: NDArray[np.floating]) -> list[str]:
             f"{dataset.name}: none of {len(dataset.train)} training cameras sees where the first Gaussians lie ({box} "
             "along x, y, z); check the poses and their axes, or raise points.box and field.bound."
         )
-    spans = [list(span) for is_blind, span in groupby(sorted(blind), key=blind.__getitem__) if is_blind]
-    if not spans:
+    shown = {view.time for view in dataset.train if seen[view.camera]}
+    blind = [view for view in dataset.train if view.time not in shown]
+    if not blind:
         return []
-    longest = max(spans, key=len)
-    names = [view.name for view in dataset.train if longest[0] <= view.time <= longest[-1]]
     return [
-        f"{dataset.name}: all cameras look away from time {longest[0]:.4g} to {longest[-1]:.4g}: "
-        f"{_named(names)} show nothing of the scene, so its motion there is a guess; check these poses, or remove "
-        "these images."
+        f"{dataset.name}: all cameras look away at {len({view.time for view in blind})} of {len(dataset.times)} times: "
+        f"{_named([view.name for view in blind])} show nothing of the scene, so its motion there is a guess; check "
+        "these poses, or remove these images."
     ]
 
 
@@ -302,30 +291,22 @@ def check_film(images: Sequence[Path]) -> list[str]:
     with ThreadPoolExecutor(4, thread_name_prefix="thumbnails") as pool:
         thumbnails = list(pool.map(lambda path: gray_thumbnail(path, THUMBNAIL), images))
     values = np.array([sharpness(thumbnail) for thumbnail in thumbnails])
-    warnings = []
-    blurry: list[int] = np.flatnonzero(blurred(values)).tolist()
-    if blurry:
-        around = sharpness_around(values)
-        shares = {i: float(values[i] / around[i]) for i in blurry}
-        worst = min(blurry, key=shares.__getitem__)
-        warnings.append(
-            f"blurred images: {_named([images[i].name for i in blurry])} ({len(blurry)} of {len(images)}) have less "
-            f"than {BLURRED:g} of their neighbours' sharpness, {images[worst].name} {shares[worst]:.2g}; leave them "
-            f"out{_with_poses(blurry, images)}."
-        )
+    blurry = [image.name for image, bad in zip(images, blurred(values), strict=True) if bad]
     repeated = [images[i].name for i in range(1, len(images)) if repeats(thumbnails[i], thumbnails[i - 1])]
-    if repeated:
-        warnings.append(
-            f"repeated images: {_named(repeated)} ({len(repeated)} of {len(images)}) differ by at most {EQUAL} of "
-            f"255 levels from the image before; motion stands still there, so leave them out"
-            f"{_with_poses(repeated, images)}."
-        )
-    return warnings
-
-
-def _with_poses(some: Sequence[object], images: Sequence[Path]) -> str:
-    """What else to remove with some of the images, where so many may not be absent."""
-    return ", and what names them" if len(some) > MOST_ABSENT * len(images) else ""
+    why = {
+        "blurred": (blurry, f"have less than {BLURRED:g} of their neighbours' sharpness"),
+        "repeated": (
+            repeated,
+            f"differ by at most {EQUAL} of 255 levels from the one before: motion stands still",
+        ),
+    }
+    # Where so many are left out, what names them must not stay.
+    return [
+        f"{word} images: {_named(names)} ({len(names)} of {len(images)}) {reason}; leave them out"
+        f"{', and what names them' if len(names) > MOST_ABSENT * len(images) else ''}."
+        for word, (names, reason) in why.items()
+        if names
+    ]
 
 
 def _named(names: Sequence[str]) -> str:

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import os
 import secrets
-import time
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
 from lapgs_wgpu.errors import InputError
-
-_HELD_OPEN = (5, 32, 33)  # Windows' errors: access denied, sharing violation, lock violation
-_WAITS = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)  # seconds
 
 
 @contextmanager
@@ -31,7 +28,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
             yield file
             file.flush()
             os.fsync(file.fileno())
-        move(temporary, path)
+        os.replace(temporary, path)
     except OSError as error:
         _remove(temporary)
         if not path.parent.exists():
@@ -46,19 +43,25 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     _sync_folder(path)
 
 
-def move(source: Path, target: Path) -> None:
-    """os.replace, of a file or a folder. Raises OSError.
+@contextmanager
+def new_folder(folder: Path, advice: str = "make room there, or name another") -> Iterator[Path]:
+    """A folder to fill, which takes the name `folder` when the block ends without an exception.
 
-    On Windows it fails while another program, such as a virus scanner, holds a file open; so it is tried again there
-    for three seconds.
+    `folder` must not exist, or be empty; where another process made it meanwhile, that one stays. Raises InputError,
+    which ends with the advice, on errors of the file system.
     """
-    for wait in (*_WAITS, None):
-        try:
-            return os.replace(source, target)
-        except PermissionError as error:
-            if wait is None or getattr(error, "winerror", None) not in _HELD_OPEN:
-                raise
-            time.sleep(wait)
+    unfinished = folder.with_name(f"{folder.name}.{secrets.token_hex(4)}.partial")
+    try:
+        unfinished.mkdir(parents=True)
+        yield unfinished
+        with suppress(OSError):
+            folder.rmdir()  # it is empty
+        if not folder.exists():
+            os.replace(unfinished, folder)
+    except OSError as error:
+        raise InputError(f"{folder} cannot be written ({error.strerror or error}); {advice}.") from None
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
 
 
 def _remove(path: Path) -> None:

@@ -71,7 +71,7 @@ def _read_motion(ply: PlyFile) -> tuple[dict[str, NDArray[Any]], dict[str, str]]
     """Tensors and metadata in the element `lapgs4d`. Raises InputError."""
     element, where = ply.elements[_ELEMENT], f"{ply.path}: element {_ELEMENT}"
     pattern = rf"^{_ELEMENT} v([0-9]{{1,9}}) safetensors ([0-9]{{1,18}})$"
-    declared = re.search(pattern, "\n".join(element.comments), re.MULTILINE)
+    declared = re.search(pattern, "\n".join(ply.comments), re.MULTILINE)
     if declared is None or element.properties != {"word": np.dtype("<u4")} or ply.encoding != "binary_little_endian":
         raise InputError(
             f"{where} lacks the line 'comment {_ELEMENT} v{VERSION} safetensors BYTES' or the one binary property "

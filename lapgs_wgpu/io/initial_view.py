@@ -63,6 +63,7 @@ class InitialView(NamedTuple):
             K, T = np.array(values["K"], float), np.array(values["T_cam_world"], float)
             camera = Camera(K, T, int(width), int(height), float(values.get("near", 0.0)))
             focus, up = np.array(values["focus"], float), np.array(values["up"], float)
+            frames, arc = int(values["frames"]), values.get("arc")
             usable = (
                 focus.shape == up.shape == (3,)
                 and bool(np.isfinite([focus, up]).all())
@@ -71,12 +72,10 @@ class InitialView(NamedTuple):
                 and max(camera.width, camera.height) <= 1 << 16
                 and np.allclose(camera.T_cam_world[:3, :3] @ camera.T_cam_world[:3, :3].T, np.eye(3), atol=1e-3)
             )
-            frames = int(values["frames"])
-            arc = None
-            if values.get("arc") is not None:
-                clockwise, counterclockwise = map(float, values["arc"])
+            if arc is not None:
+                clockwise, counterclockwise = map(float, arc)
                 arc = clockwise, counterclockwise
-                usable = usable and clockwise >= 0 and counterclockwise >= 0 and clockwise + counterclockwise <= 360
+                usable = usable and min(arc) >= 0 and sum(arc) <= 360
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError):
             return None
         if not usable:

@@ -6,19 +6,17 @@ docs/format.md has it byte by byte. Browsers unpack it by themselves (Decompress
 from __future__ import annotations
 
 import io
-import os
-import stat
 import struct
 import zlib
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.io.regular_file import PathLike, open_regular
 from lapgs_wgpu.io.safetensors_file import pack_tensors, unpack_tensors
-
-PathLike = str | os.PathLike[str]
 
 MAGIC = b"lapgs4d\n"
 VERSION = 2  # 1 has no outliers, and whole numbers alone
@@ -29,13 +27,9 @@ _MOST_RATIO = 64  # of unpacked bytes to packed ones: a small file cannot fill t
 
 def is_lapgs(path: PathLike) -> bool:
     """Whether a file begins as a compact scene does; False where it cannot be read."""
-    try:
-        if not stat.S_ISREG(os.stat(path).st_mode):
-            return False
-        with open(path, "rb") as file:
-            return file.read(len(MAGIC)) == MAGIC
-    except (OSError, ValueError):
-        return False
+    with suppress(ValueError), open_regular(path) as file:
+        return file.read(len(MAGIC)) == MAGIC
+    return False
 
 
 def pack_lapgs(tensors: Mapping[str, NDArray[Any]], metadata: Mapping[str, str]) -> bytes:
@@ -61,12 +55,8 @@ def read_lapgs(path: PathLike) -> tuple[dict[str, NDArray[Any]], dict[str, str]]
 
     Raises InputError where the file cannot be read, is damaged, or comes from a later version.
     """
-    try:
-        with open(path, "rb") as file:
-            data = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path.") from None
-    return unpack_lapgs(data, str(path))
+    with open_regular(path) as file:
+        return unpack_lapgs(file.read(MAX_BYTES + 1), str(path))
 
 
 def unpack_lapgs(data: bytes, where: str) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
@@ -82,12 +72,10 @@ def unpack_lapgs(data: bytes, where: str) -> tuple[dict[str, NDArray[Any]], dict
             f"{where}: has version {version} of the compact scene, and this program reads versions 1 to {VERSION}; "
             "export the scene again, or use the program that wrote it"
         )
-    if size > MAX_BYTES:
-        raise InputError(f"{where}: unpacks to {size} bytes, and a compact scene has at most {MAX_BYTES}")
-    if size > _MOST_RATIO * packed:
+    if size > min(MAX_BYTES, _MOST_RATIO * packed):
         raise InputError(
-            f"{where}: declares {size} bytes in {packed} packed ones, which hold {_MOST_RATIO} times their number at "
-            "most; the file is damaged"
+            f"{where}: declares {size} bytes in {packed} packed ones, of at most {MAX_BYTES}, and {_MOST_RATIO} times "
+            "the packed ones; the file is damaged"
         )
     unpacker = zlib.decompressobj()
     try:
@@ -95,8 +83,5 @@ def unpack_lapgs(data: bytes, where: str) -> tuple[dict[str, NDArray[Any]], dict
     except zlib.error as error:
         raise InputError(f"{where}: cannot be unpacked ({str(error)[:80]}); the file is damaged") from None
     if len(content) != size or not unpacker.eof or unpacker.unused_data:
-        held = "more, or are followed by others" if len(content) >= size else f"{len(content)}"
-        raise InputError(
-            f"{where}: declares {size} bytes, but its {packed} packed ones hold {held}; the file is damaged"
-        )
+        raise InputError(f"{where}: its {packed} packed bytes do not hold the {size} declared; the file is damaged")
     return unpack_tensors(io.BytesIO(content), size, where)

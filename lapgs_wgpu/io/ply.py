@@ -113,9 +113,7 @@ def read_gaussians(ply: PlyFile) -> GaussianSnapshot:
 def vertex_of(ply: PlyFile) -> Element:
     """The element that holds Gaussians. Raises InputError where there is none."""
     if "vertex" not in ply.elements:
-        raise InputError(
-            f"{ply.path}: has no element vertex without a list, so it holds no Gaussians; give a 3DGS .ply file"
-        )
+        raise InputError(f"{ply.path}: has no element vertex, so it holds no Gaussians; give a 3DGS .ply file")
     return ply.elements["vertex"]
 
 
@@ -156,16 +154,12 @@ def gaussian_names(vertex: Element, known: set[str], path: PathLike) -> list[str
     names = _names(rest)
     missing = [name for name in names if name not in known]
     if missing:
-        more = f" and {len(missing) - 5} more" if len(missing) > 5 else ""
-        cloud = not any(name.startswith(("opacity", "scale_", "rot_")) for name in properties)
-        problem = (
-            "so it holds no Gaussians; a cloud of points is not shown, and a training may start at it"
-            if cloud
-            else "without which its Gaussians are not complete; export it with all properties of 3DGS"
-        )
+        problem = "without which its Gaussians are not complete; export it with all properties of 3DGS"
+        if not any(name.startswith(("opacity", "scale_", "rot_")) for name in properties):
+            problem = "so it holds no Gaussians; a cloud of points is not shown, and a training may start at it"
         raise InputError(
-            f"{path}: its element vertex lacks the property {', '.join(missing[:5])}{more} "
-            f"({len(properties)} properties found), {problem}"
+            f"{path}: its element vertex has {len(properties)} properties and lacks {len(missing)}, such as "
+            f"{', '.join(missing[:5])}, {problem}"
         )
     if vertex.count == 0:
         raise InputError(f"{path}: holds 0 Gaussians; at least 1 is needed")

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import os
 import re
-import stat
-import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -20,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.io.regular_file import PathLike, open_regular
 
-PathLike = str | os.PathLike[str]
 Floats = NDArray[np.float32]
 
 BAD_SHARE = 0.01  # of all rows: up to it rows with NaN are left out, above it a file is damaged
@@ -39,23 +37,16 @@ _SCALARS = {
 
 @dataclass
 class Element:
-    """An element: `count` rows of scalar `properties` and of `lists`, of which a row holds a length and as many values.
+    """An element: `count` rows of scalar `properties`. has_lists: whether a row also holds lists, of any length.
 
-    offset: byte of the file at which it begins; line after the header in a text file. comments: those below its line.
-    order: its scalars' bytes and its lists' types, in the order of a row.
+    offset: byte of the file at which it begins; line after the header in a text file.
     """
 
     name: str
     count: int
     properties: dict[str, np.dtype[Any]] = field(default_factory=dict)
-    comments: list[str] = field(default_factory=list)
+    has_lists: bool = False
     offset: int = 0
-    order: list[int | tuple[str, int]] = field(default_factory=list)
-
-    @property
-    def has_lists(self) -> bool:
-        """Whether a row's size is not known."""
-        return any(isinstance(part, tuple) for part in self.order)
 
     @property
     def stride(self) -> int:
@@ -104,32 +95,24 @@ class PlyFile(NamedTuple):
                 f"{self.path}: declares {element.count} rows of {element.name}, but {len(lines)} lines follow; it is "
                 "truncated."
             )
-        width = len(element.properties)
-        table = np.empty((element.count, width))
+        layout = np.dtype([(name, np.float64) for name in element.properties])
+        table = np.empty(element.count, layout)
         for number, line in enumerate(lines):
             try:
-                table[number] = np.array(line.split(), np.float64).reshape(width)
+                table[number] = tuple(map(float, line.split()))
             except ValueError:
-                raise InputError(
-                    f"{self.path}: row {number} of {element.name}, {line[:80]!r}, does not hold {width} numbers; "
-                    "the file is damaged."
-                ) from None
-        yield 0, table.view(np.dtype([(name, np.float64) for name in element.properties]))[:, 0]
+                what = f"{self.path}: row {number} of {element.name}, {line[:80]!r},"
+                raise InputError(f"{what} does not hold {len(element.properties)} numbers; it is damaged.") from None
+        yield 0, table
 
 
 @contextmanager
 def open_ply(path: PathLike) -> Iterator[PlyFile]:
     """Open a file and read its header. The sizes of the elements add up to the file size. Raises InputError."""
-    try:
-        mode = os.stat(path).st_mode  # before opening: a pipe would block, a device could be endless
-        if stat.S_ISDIR(mode):
-            raise InputError(f"{path}: is a folder{_advice(Path(path))}.")
-        if not stat.S_ISREG(mode):
-            raise InputError(f"{path}: is not a regular file; give a .ply file.")
-        with open(path, "rb") as file:
-            yield _read_header(file, path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path.") from error
+    if os.path.isdir(path):
+        raise InputError(f"{path}: is a folder{_advice(Path(path))}.")
+    with open_regular(path) as file:
+        yield _read_header(file, path)
 
 
 def _advice(folder: Path) -> str:
@@ -183,9 +166,8 @@ def _parse_lines(lines: list[str], path: PathLike) -> tuple[str, dict[str, Eleme
     for number, line in enumerate(lines, start=2):
         where = f"{path}: header line {number}, {line[:80]!r},"
         match line.split():
-            case ["comment" | "obj_info", *words]:
-                if last is not None:
-                    last.comments.append(" ".join(words))
+            case ["comment" | "obj_info", *_]:
+                pass
             case ["format", encoding, _]:
                 if encoding not in _BYTE_ORDERS:
                     raise InputError(f"{where} has none of the encodings {', '.join(_BYTE_ORDERS)}.")
@@ -196,8 +178,7 @@ def _parse_lines(lines: list[str], path: PathLike) -> tuple[str, dict[str, Eleme
                     raise InputError(f"{where} does not declare a count from 0 to 10^18 - 1; the file is damaged.")
                 last = elements[name] = Element(name, int(count))
             case ["property", "list", length, kind, _] if last is not None and {length, kind} <= _SCALARS.keys():
-                code = _BYTE_ORDERS.get(encoding, "<") + np.dtype(_SCALARS[length]).char
-                last.order.append((code, np.dtype(_SCALARS[kind]).itemsize))
+                last.has_lists = True
             case ["property", kind, name]:
                 if last is None or kind not in _SCALARS:
                     what = (
@@ -207,7 +188,6 @@ def _parse_lines(lines: list[str], path: PathLike) -> tuple[str, dict[str, Eleme
                 if name in last.properties:
                     raise InputError(f"{where} declares a property a second time; the file is damaged.")
                 last.properties[name] = np.dtype(_BYTE_ORDERS.get(encoding, "<") + _SCALARS[kind])
-                last.order.append(last.properties[name].itemsize)
             case _:
                 raise InputError(f"{where} is not a line of a PLY header; the file is damaged.")
     if not encoding:
@@ -218,17 +198,22 @@ def _parse_lines(lines: list[str], path: PathLike) -> tuple[str, dict[str, Eleme
 def _place(
     elements: dict[str, Element], encoding: str, start: int, file: BinaryIO, path: PathLike
 ) -> dict[str, Element]:
-    """Set the offsets of the elements and return those without lists. They must fill the file."""
+    """Set the offsets of the elements and return those without lists. They must fill the file.
+
+    Of a binary file, those behind an element with lists are passed over, too: where they begin is not known.
+    """
     text, size = encoding == "ascii", os.fstat(file.fileno()).st_size
     end, line = start, 0
-    rest = {element.name for element in elements.values() if not element.has_lists}
     placed: dict[str, Element] = {}
     for element in elements.values():
+        before = not text and "vertex" in elements and "vertex" not in placed
+        if element.has_lists and (element.name == "vertex" or before):
+            raise InputError(
+                f"{path}: element {element.name[:40]!r} has lists, which are read neither in vertex nor before it; "
+                "write the file again with another program."
+            )
         if element.has_lists and not text:
-            if rest == placed.keys():
-                return placed
-            end = _end_of_lists(element, end, file, path)
-            continue
+            return placed
         if not element.has_lists:
             placed[element.name] = element
         element.offset = line if text else end
@@ -248,28 +233,3 @@ def _place(
             "appended."
         )
     return placed
-
-
-def _end_of_lists(element: Element, start: int, file: BinaryIO, path: PathLike) -> int:
-    """The byte of a binary file at which an element with lists ends, which begins at `start`."""
-    file.seek(0)
-    data, at = file.read(), start
-    try:
-        for _ in range(element.count):
-            for part in element.order:
-                if isinstance(part, tuple):
-                    code, size = part
-                    (length,) = struct.unpack_from(code, data, at)
-                    at += struct.calcsize(code) + int(length) * size
-                else:
-                    at += part
-            if not start < at <= len(data):
-                break
-    except (struct.error, ValueError, OverflowError):  # a length that is no whole number
-        at = -1
-    if not start <= at <= len(data):
-        raise InputError(
-            f"{path}: element {element.name[:40]!r} ({element.count} rows with lists) does not end within the "
-            f"{len(data)} bytes of the file: it is truncated or its header is wrong."
-        )
-    return at

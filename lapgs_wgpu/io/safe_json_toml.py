@@ -8,13 +8,12 @@ from __future__ import annotations
 import json
 import os
 import re
-import stat
 import tomllib
+from collections.abc import Callable
 from typing import Any
 
 from lapgs_wgpu.errors import InputError
-
-PathLike = str | os.PathLike[str]
+from lapgs_wgpu.io.regular_file import PathLike, open_regular
 
 MAX_JSON_BYTES = 64 << 20
 MAX_TOML_BYTES = 256 << 10
@@ -30,17 +29,7 @@ def read_json(path: PathLike) -> Any:
 
 def parse_json(text: str, where: str) -> Any:
     """Parse JSON text. Raises InputError; its message begins with `where`."""
-    try:
-        value = json.loads(text)
-    except json.JSONDecodeError as error:
-        place = f"line {error.lineno}, column {error.colno}"
-        raise InputError(f"{where}: cannot be read as JSON: {error.msg} at {place}.") from None
-    except ValueError as error:  # a number of more than 4300 digits
-        raise InputError(f"{where}: cannot be read as JSON: {str(error)[:120]}.") from None
-    except RecursionError:
-        raise InputError(f"{where}: cannot be read as JSON: it is nested too deeply.") from None
-    _check_depth(value, where, "JSON")
-    return value
+    return _parsed(json.loads, text, where, "JSON")
 
 
 def read_toml(path: PathLike) -> dict[str, Any]:
@@ -48,33 +37,30 @@ def read_toml(path: PathLike) -> dict[str, Any]:
     text = _read_text(path, MAX_TOML_BYTES, "TOML")
     if _LONG_KEY.search(text):
         raise InputError(f"{path}: cannot be read as TOML: it holds a dotted key of more than 16 parts.")
+    return _parsed(tomllib.loads, text, str(path), "TOML")
+
+
+def _parsed(parse: Callable[[str], Any], text: str, where: str, language: str) -> Any:
     try:
-        table = tomllib.loads(text)
+        value = parse(text)
     except ValueError as error:
-        raise InputError(f"{path}: cannot be read as TOML: {str(error)[:200]}.") from None
+        raise InputError(f"{where}: cannot be read as {language}: {str(error)[:200]}.") from None
     except RecursionError:
-        raise InputError(f"{path}: cannot be read as TOML: it is nested too deeply.") from None
-    _check_depth(table, str(path), "TOML")
-    return table
+        raise InputError(f"{where}: cannot be read as {language}: it is nested too deeply.") from None
+    _check_depth(value, where, language)
+    return value
 
 
 def _read_text(path: PathLike, most: int, language: str) -> str:
+    with open_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > most:
+            raise InputError(f"{path}: cannot be read as {language}: it has {size} bytes, over {most}.")
+        data = file.read(size)
     try:
-        found = os.stat(path)  # before opening: a pipe would block, a device never end
-        if not stat.S_ISREG(found.st_mode):
-            raise InputError(f"{path}: cannot be read as {language}: it is not a regular file.")
-        if found.st_size > most:
-            raise InputError(f"{path}: cannot be read as {language}: it has {found.st_size} bytes, over {most}.")
-        with open(path, "rb") as file:
-            return file.read(found.st_size).decode("utf-8-sig" if language == "JSON" else "utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path.") from None
-    except InputError:
-        raise
+        return data.decode("utf-8-sig" if language == "JSON" else "utf-8")
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: cannot be read as {language}: byte {error.start} is not UTF-8.") from None
-    except ValueError as error:  # a name that no file can have
-        raise InputError(f"{path!r}: cannot be read ({error}); check the path.") from None
 
 
 def _check_depth(value: Any, where: str, language: str) -> None:

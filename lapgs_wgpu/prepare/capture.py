@@ -13,10 +13,10 @@ import numpy as np
 from lapgs_wgpu.data.images import Size, check_image
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.masks import Mask, check_mask_folder
-from lapgs_wgpu.data.readers.calibration import match_names, read_calibration
 from lapgs_wgpu.data.readers.colmap import IMAGES, SPARSE
 from lapgs_wgpu.data.timestamps import write_times
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.prepare.calibration import match_names, read_calibration
 from lapgs_wgpu.prepare.capture_folder import WORK, RefusedError, appearing
 from lapgs_wgpu.prepare.film import Film
 from lapgs_wgpu.prepare.flow import Motion, film_frames

@@ -11,7 +11,6 @@ from lapgs_wgpu.data.load import READERS
 from lapgs_wgpu.data.readers.colmap import IMAGES, SPARSE
 from lapgs_wgpu.data.timestamps import TIMES
 from lapgs_wgpu.errors import InputError, quoted
-from lapgs_wgpu.io.atomic import move
 from lapgs_wgpu.io.folder_lock import LOCK, locked_folder
 from lapgs_wgpu.io.listing import listed
 from lapgs_wgpu.prepare.masks import MASKS
@@ -55,7 +54,7 @@ def appearing(out: Path) -> Iterator[Path]:
                 for name in (IMAGES, SPARSE, TIMES, MASKS, REPORT, REFUSED):
                     shutil.rmtree(out / name) if (out / name).is_dir() else (out / name).unlink(missing_ok=True)
             for child in sorted(partial.iterdir()):
-                move(child, out / child.name)
+                child.replace(out / child.name)
             partial.rmdir()
         except OSError as error:
             raise InputError(

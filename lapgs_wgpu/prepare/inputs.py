@@ -41,7 +41,7 @@ class Stills(Film):
         if len(files) < 2:
             raise InputError(f"{files[0]} is one image; give all images of the camera, or the folder that holds them.")
         folder = self.path if (self.path / TIMES).is_file() else self.path.parent
-        times, source = read_times([ImageName(file.name) for file in self._files], folder, self.notes)
+        times, source = read_times([ImageName(file.name) for file in self._files], folder)
         unit = 1.0
         if source.startswith("the frame numbers"):
             unit = 1 / NUMBERED

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from lapgs_wgpu.data.images import Size, shrunk_size, size_text
-from lapgs_wgpu.data.readers.calibration import Calibrated, match_names, read_calibration
 from lapgs_wgpu.data.readers.panoptic import FILES, IMAGES
-from lapgs_wgpu.data.split import CAMERAS
 from lapgs_wgpu.data.stamps import natural_key
+from lapgs_wgpu.data.timestamps import CAMERAS
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.prepare.calibration import Calibrated, match_names, read_calibration
 from lapgs_wgpu.prepare.capture_folder import RefusedError
 from lapgs_wgpu.prepare.film import Film
 from lapgs_wgpu.prepare.images import LONGER_SIDE, Picture, Shape, common_times, extract_in_step

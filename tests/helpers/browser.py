@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import io
 import json
 import shutil
 import subprocess
@@ -12,10 +13,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-import imageio.v3 as iio
 import numpy as np
 from helpers.waiting import wait_for
 from numpy.typing import NDArray
+from PIL import Image
 
 CHROMIUM = next((path for path in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if path), None)
 _FLAGS = (
@@ -108,7 +109,7 @@ class Browser:
     def picture(self) -> NDArray[np.int16]:
         """(height, width, 3): what is on the screen."""
         data = self.call("Page.captureScreenshot", format="png")["data"]
-        return iio.imread(base64.b64decode(data), extension=".png")[..., :3].astype(np.int16)
+        return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB")).astype(np.int16)
 
     def mouse(self, kind: str, x: float, y: float, *, down: bool = False) -> None:
         """kind: mouseMoved, mousePressed or mouseReleased, of the left button."""

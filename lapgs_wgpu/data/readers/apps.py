@@ -43,16 +43,18 @@ def _read_record3d(folder: Path, image_size: int | None) -> Capture:
     assert layout is not None
     path, images = layout
     data = read_json(path)
-    files = {int(file.stem): file for file in listed(images)
-             if file.suffix.lower() in SUFFIXES and file.stem.isascii() and file.stem.isdigit()}  # fmt: skip
+    pictures = [file for file in listed(images) if file.suffix.lower() in SUFFIXES]
+    files = {int(file.stem): file for file in pictures if file.stem.isascii() and file.stem.isdigit()}
     poses = data.entries("poses")
     if max(files) >= len(poses):
         raise InputError(
             f"{path} has {len(poses)} poses, but there is {files[max(files)]}; frame i needs the pose i: export again."
         )
-    timed = "frameTimestamps" if data.values.get("frameTimestamps") else "fps"
-    times = data.entries(timed, len(poses)) if timed == "frameTimestamps" else None
-    rate = 1.0 if times is not None else data.number("fps", 1e-9, 1e5)
+    if data.values.get(timed := "frameTimestamps"):
+        times = data.entries(timed, len(poses))
+    else:
+        timed, rate = "fps", data.number("fps", 1e-9, 1e5)
+        times = [index / rate for index in range(len(poses))]
     if data.values.get("perFrameIntrinsicCoeffs"):
         intrinsics = data.entries("perFrameIntrinsicCoeffs", len(poses))
     else:
@@ -71,7 +73,7 @@ def _read_record3d(folder: Path, image_size: int | None) -> Capture:
                 world_to_camera(R_world_cam @ OPENGL_TO_OPENCV, np.array(position)),
                 where,
                 ImageName(f"{images.name}/{file.name}"),
-                index / rate if times is None else number(times[index], "frameTimestamps", where),
+                number(times[index], timed, where),
             )
         )
     absent = len(poses) - len(files)

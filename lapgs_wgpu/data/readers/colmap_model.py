@@ -1,13 +1,13 @@
 """Sparse models of COLMAP on disk, text or binary: cameras, images and points3D.
 
-The formats are those of COLMAP's documentation (colmap.github.io/format.html). Binary files are untrusted: every
-declared count is compared with the file size before anything is read.
+The formats are those of COLMAP's documentation (colmap.github.io/format.html). Binary files are untrusted: a
+declared count reserves no memory.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -97,10 +97,8 @@ def read_model(folder: Path) -> ColmapModel:
 def _camera(where: str, model: str, width: float, height: float, values: list[float]) -> Lens:
     """Check the values of a camera. Raises InputError."""
     if model not in PARAMETERS:
-        cut = model == "EQUIRECTANGULAR"
-        advice = (
-            "cut pinhole views out of the panoramas" if cut else "undistort the images with colmap image_undistorter"
-        )
+        cut = "cut pinhole views out of the panoramas"
+        advice = cut if model == "EQUIRECTANGULAR" else "undistort the images with colmap image_undistorter"
         raise InputError(
             f"{where}: its model {model[:40]} is not among those that are read ({', '.join(PARAMETERS)}); {advice}."
         )
@@ -189,6 +187,11 @@ def _text_images(path: Path) -> list[ColmapImage]:
 
 def _text_points(path: Path) -> tuple[Array, NDArray[np.uint8]]:
     rows = [_numbers(words[1:7], where) for where, words in _lines(path, "id, X, Y, Z, R, G, B, error")]
+    return _points(rows)
+
+
+def _points(rows: Sequence[Sequence[float]]) -> tuple[Array, NDArray[np.uint8]]:
+    """Places (N, 3) and colors (N, 3) of rows of X, Y, Z, R, G, B."""
     values = np.array(rows, dtype=np.float64).reshape(-1, 6)
     return values[:, :3], np.clip(np.nan_to_num(values[:, 3:]), 0, 255).astype(np.uint8)
 
@@ -218,13 +221,8 @@ class _Bytes:
             raise self.damaged(f"ends too early: {size} bytes are needed at byte {self.at} of {len(self.data)}")
         self.at += size
 
-    def count(self, least: int, what: str) -> int:
-        """Return a count of items that take at least so many bytes each."""
-        (count,) = self.take("Q")
-        rest = len(self.data) - self.at
-        if count * least > rest:
-            raise self.damaged(f"declares {count} {what}, which need {count * least} bytes or more, but {rest} follow")
-        return int(count)
+    def count(self) -> int:
+        return int(self.take("Q")[0])
 
     def name(self) -> str:
         end = self.data.find(b"\0", self.at, self.at + LONGEST_NAME)
@@ -242,7 +240,7 @@ class _Bytes:
 
 def _binary_cameras(path: Path) -> dict[int, Lens]:
     cameras, file = {}, _Bytes(path)
-    for index in range(file.count(24, "cameras")):
+    for index in range(file.count()):
         identity, model, width, height = file.take("iiQQ")
         name, names = MODELS.get(model, (OTHER_MODELS.get(model, f"number {model}"), ()))
         values = list(file.take(f"{len(names)}d"))
@@ -253,22 +251,19 @@ def _binary_cameras(path: Path) -> dict[int, Lens]:
 
 def _binary_images(path: Path) -> list[ColmapImage]:
     images, file = [], _Bytes(path)
-    for index in range(file.count(69 + 8, "images")):
+    for index in range(file.count()):
         _, *pose, camera = file.take("i7di")
         name = file.name()
-        file.skip(24 * file.count(24, f"points of {name[:80]}"))
+        file.skip(24 * file.count())
         images.append(_image(name, camera, np.array(pose), f"{path}, image {index} ({name[:80]})"))
     file.end()
     return images
 
 
 def _binary_points(path: Path) -> tuple[Array, NDArray[np.uint8]]:
-    file = _Bytes(path)
-    count = file.count(43 + 8, "points")
-    points, colors = np.empty((count, 3)), np.empty((count, 3), np.uint8)
-    for index in range(count):
-        _, *values, _ = file.take("Q3d3Bd")
-        points[index], colors[index] = values[:3], values[3:]
-        file.skip(8 * file.count(8, f"images that see point {index}"))
+    file, rows = _Bytes(path), []
+    for _ in range(file.count()):
+        rows.append(file.take("Q3d3Bd")[1:7])
+        file.skip(8 * file.count())
     file.end()
-    return points, colors
+    return _points(rows)

@@ -26,13 +26,13 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.data.cloud import Cloud, find_cloud, read_cloud, read_npy
 from lapgs_wgpu.data.evenly import evenly
-from lapgs_wgpu.data.frames import Capture, Frame, ImageSource, Reader
+from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import SUFFIXES, ImageFile, check_image, decode, decode_gray, size_text
 from lapgs_wgpu.data.json_fields import LARGEST_ENTRY, LARGEST_SIDE
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.poses import check_rotation, world_to_camera
 from lapgs_wgpu.data.stamps import ImageName, natural_key
-from lapgs_wgpu.data.video_frames import Video, VideoFrame
+from lapgs_wgpu.data.video_frames import unpacked
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.listing import listed
 
@@ -102,16 +102,13 @@ def _row(row: Array, where: str, axes: Array) -> dict[str, Any]:
 
 def _read_neu3d(folder: Path, image_size: int | None) -> Capture:
     path = folder / POSES
-    recordings = _recordings(folder)
+    recordings = _recordings(folder, image_size)
     rows = _read_rows(path, [recording.name for recording in recordings], "recordings", LLFF)
-    names = [recording.stem for recording in recordings]
-    warnings = []
+    names, warnings = [recording.stem for recording in recordings], []
     if names != sorted(names):
-        odd = next(i for i, name in enumerate(sorted(names)) if name != names[i])
         warnings.append(
-            f"{path}: its rows are taken in the order of the cameras' numbers, so row {odd} is of {names[odd]}; if "
-            f"they are in the order of the names, in which it is of {sorted(names)[odd]}, number the cameras with "
-            "leading zeros."
+            f"{path}: its rows are taken in the order of the cameras' numbers, {', '.join(names)}; if they are in that "
+            "of the names, number the cameras with leading zeros."
         )
     first, *others = recordings
     count = len(recordings[first])
@@ -124,7 +121,8 @@ def _read_neu3d(folder: Path, image_size: int | None) -> Capture:
     frames = [
         Frame(
             image,
-            name=ImageName(f"{recording.stem}/{_file_name(image, index)}", recording.stem),
+            # Masks of a film's frames are named by their numbers from 0 on.
+            name=ImageName(f"{recording.stem}/{f'{index}.png' if image.source else image.path.name}", recording.stem),
             time=index,
             split="test" if recording is first else "train",
             label=f"{recording.stem}_{index:05d}",
@@ -145,31 +143,30 @@ def _read_neu3d(folder: Path, image_size: int | None) -> Capture:
     )
 
 
-def _recordings(folder: Path) -> dict[Path, list[ImageSource]]:
-    """Return the frames of each camera, by its number. Images take precedence over a video of the same camera."""
-    videos = {child.stem: child for child in sorted(folder.iterdir()) if child.suffix.lower() == ".mp4"}
-    folders = {child.name: child for child in sorted(folder.iterdir()) if (child / IMAGES).is_dir()}
-    recordings = {name: path for name, path in (videos | folders).items() if CAMERA.fullmatch(name)}
-    if len(recordings) < 2:
+def _recordings(folder: Path, image_size: int | None) -> dict[Path, list[ImageFile]]:
+    """Return the frames of each camera, by its number: its images if all cameras have them, else those of its film."""
+    children = sorted(
+        (c for c in folder.iterdir() if CAMERA.fullmatch(c.stem)), key=lambda child: natural_key(child.stem)
+    )
+    films = [child for child in children if child.suffix.lower() == ".mp4"]
+    folders = [child for child in children if (child / IMAGES).is_dir()]
+    cameras = {child.stem for child in (*films, *folders)}
+    if len(cameras) < 2:
         raise InputError(
-            f"{folder} holds the recordings of {len(recordings)} cameras, cam00.mp4, ... or cam00/images/*.png, ...; "
+            f"{folder} holds the recordings of {len(cameras)} cameras, cam00.mp4, ... or cam00/images/*.png, ...; "
             "at least 2 are needed: one for testing, one for training."
         )
-    paths = sorted(recordings.values(), key=lambda path: natural_key(path.stem))
-    return {path: _of_folder(path / IMAGES) if path.is_dir() else _of_video(path) for path in paths}
+    if len(folders) == len(cameras):
+        return {path: _of_folder(path / IMAGES) for path in folders}
+    if len(films) < len(cameras):
+        raise InputError(
+            f"{folder} holds films of {len(films)} cameras and images of {len(folders)}, and either must be of all "
+            f"{len(cameras)}; add what is missing."
+        )
+    return {path: unpacked(path, image_size) for path in films}
 
 
-def _file_name(image: ImageSource, index: int = 0) -> str:
-    """The name of an image; of a film's frame, its number from 0 on, which masks are named by."""
-    return image.path.name if isinstance(image, ImageFile) else f"{index}.png"
-
-
-def _of_video(path: Path) -> list[ImageSource]:
-    video = Video(path)
-    return [VideoFrame(video, index) for index in range(video.frames)]
-
-
-def _of_folder(folder: Path, *, whole: bool = False) -> list[ImageSource]:
+def _of_folder(folder: Path, *, whole: bool = False) -> list[ImageFile]:
     """Return the images of a folder, by number. whole: of `check_image`; whole, those of a rig may be gigabytes.
 
     Raises InputError if there is none.
@@ -186,7 +183,7 @@ def _of_folder(folder: Path, *, whole: bool = False) -> list[ImageSource]:
 def _read_endonerf(folder: Path, image_size: int | None) -> Capture:
     path = folder / POSES
     images = _of_folder(folder / IMAGES, whole=True)
-    names = [_file_name(image) for image in images]
+    names = [image.path.name for image in images]
     rows = _read_rows(path, names, "images", np.eye(3))
     frames = [
         Frame(
@@ -213,7 +210,7 @@ def _read_endonerf(folder: Path, image_size: int | None) -> Capture:
 
 def _depth_cloud(folder: Path, frames: list[Frame]) -> Cloud:
     """Make points at the depths of some of the maps, in their images' colors. Raises InputError."""
-    maps = [Path(str(image)) for image in _of_folder(folder / DEPTH)]
+    maps = [image.path for image in _of_folder(folder / DEPTH)]
     if len(maps) != len(frames):
         raise InputError(
             f"{folder / DEPTH} holds {len(maps)} depth maps for {len(frames)} images; each image needs one, or remove "

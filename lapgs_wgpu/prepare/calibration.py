@@ -19,7 +19,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from lapgs_wgpu.data.images import ImageFile, Size, size_text
-from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, Fields, as_fields, read_json, vector
+from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, Fields, as_fields, matrix, read_json
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.poses import OPENGL_TO_OPENCV, Array, check_rotation, opengl_pose, world_to_camera
 from lapgs_wgpu.data.readers.colmap_model import is_model, read_model
@@ -33,6 +33,12 @@ FORMATS = (
 )
 _MATRIX = re.compile(r"^(\w+):\s*!!opencv-matrix\s+rows:.*\s+cols:.*\s+dt:.*\s+data:\s*\[([^\]]*)\]", re.MULTILINE)
 SAME = 0.01  # by so much the proportions of images may differ from those that a file states
+_QUALISYS = [  # attributes, by their elements
+    *(f"transform.{n}" for n in ("x", "y", "z", *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)))),
+    *(f"intrinsic.{n}{axis}" for n in ("focalLength", "centerPoint") for axis in "UV"),
+    *(f"intrinsic.{n}Distortion{i}" for n in ("radial", "tangental") for i in (1, 2)),
+    *(f"fov_video.{side}" for side in ("left", "right", "top", "bottom")),
+]
 _STEREO = {"M1": "K_1", "D1": "dist_1", "M2": "K_2", "D2": "dist_2", "R": "Rot_2", "T": "T_2"}
 
 
@@ -93,11 +99,9 @@ def _nerfstudio(data: Fields) -> dict[str, Calibrated]:
 def _panoptic(data: Fields) -> dict[str, Calibrated]:
     cameras = {}
     for entry in data.objects("cameras", "camera"):
-        K, R, t = (np.array(entry.entries(name), np.float64) for name in ("K", "R", "t"))
-        width, height = entry.vector("resolution", 2)
-        size = round(float(width)), round(float(height))
+        K, R, t, distortion = (np.array(entry.entries(name), np.float64) for name in ("K", "R", "t", "distCoef"))
         name = str(entry.required("name"))
-        cameras[name] = _camera(K, entry.entries("distCoef"), R, t, size, f"{entry.where} ({name})")
+        cameras[name] = _camera(K, distortion, R, t, entry.vector("resolution", 2), f"{entry.where} ({name})")
     return cameras
 
 
@@ -109,12 +113,10 @@ def _toml(path: Path) -> dict[str, Calibrated]:
         entry = as_fields(value, f"{path}, {key}")
         if entry.values.get("fisheye"):
             raise InputError(f"{entry.where} has a fisheye lens, which is not read; undistort its film first.")
-        K = np.stack([vector(row, 3, "matrix", entry.where) for row in entry.entries("matrix", 3)])
-        width, height = entry.vector("size", 2)
+        K = matrix(entry.required("matrix"), (3, 3), "matrix", entry.where)
         rotation, translation = entry.vector("rotation", 3), entry.vector("translation", 3)
-        size = round(float(width)), round(float(height))
-        name = str(value.get("name", key))
-        cameras[name] = _camera(K, entry.entries("distortions"), rotation, translation, size, entry.where)
+        size, distortion = entry.vector("size", 2), entry.entries("distortions")
+        cameras[str(value.get("name", key))] = _camera(K, distortion, rotation, translation, size, entry.where)
     return cameras
 
 
@@ -150,23 +152,15 @@ def _qualisys(path: Path) -> dict[str, Calibrated]:
         where = f"{path}, camera {camera.get('serial', number)}"
         parts = {tag: camera.find(tag) for tag in ("transform", "intrinsic", "fov_video")}
         found = {f"{tag}.{k}": v for tag, part in parts.items() if part is not None for k, v in part.attrib.items()}
-        needed = ["transform." + n for n in ("x", "y", "z", *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)))]
-        needed += [f"intrinsic.{n}{axis}" for n in ("focalLength", "centerPoint") for axis in "UV"]
-        needed += [f"intrinsic.{n}" for n in ("radialDistortion1", "radialDistortion2")]
-        needed += [f"intrinsic.tangentalDistortion{i}" for i in (1, 2)]
-        needed += [f"fov_video.{side}" for side in ("left", "right", "top", "bottom")]
-        if missing := [name for name in needed if name not in found]:
+        if missing := [name for name in _QUALISYS if name not in found]:
             raise InputError(f"{where} has no {missing[0]}; export the calibration of video cameras.")
         x, y, z, *R, fx, fy, cx, cy, k1, k2, p1, p2, left, right, top, bottom = _numbers(
-            " , ".join(found[name] for name in needed), where
+            ",".join(found[name] for name in _QUALISYS), where
         )
         rotation = OPENGL_TO_OPENCV @ np.array(R).reshape(3, 3)
         K = np.array([[fx / 64, 0, cx / 64 - left], [0, fy / 64, cy / 64 - top], [0, 0, 1]])
-        size = round(right - left) + 1, round(bottom - top) + 1
-        place = np.array([x, y, z]) / 1000
-        cameras[camera.get("serial", str(number))] = _camera(
-            K, [k1, k2, p1, p2], rotation, -rotation @ place, size, where
-        )
+        size, t = (right - left + 1, bottom - top + 1), -rotation @ np.array([x, y, z]) / 1000
+        cameras[camera.get("serial", str(number))] = _camera(K, [k1, k2, p1, p2], rotation, t, size, where)
     return cameras
 
 
@@ -178,7 +172,12 @@ def _numbers(text: str, where: object) -> list[float]:
 
 
 def _camera(
-    K: Array, distortion: Iterable[Any], rotation: Array, translation: Array, size: Size | None, where: str
+    K: Array,
+    distortion: Iterable[Any],
+    rotation: Array,
+    translation: Array,
+    size: Iterable[float] | None,
+    where: str,
 ) -> Calibrated:
     """Check the values of a camera of OpenCV. distortion: k1, k2, p1, p2, k3. rotation: (3, 3), or a Rodrigues vector.
     Raises InputError."""
@@ -195,7 +194,7 @@ def _camera(
         raise InputError(f"{where}: focal lengths of {K[0, 0]:g} and {K[1, 1]:g} pixels are those of no camera.")
     R = Rotation.from_rotvec(rotation).as_matrix() if rotation.ndim == 1 else rotation
     check_rotation(R, f"{where}: its rotation")
-    width, height = size or (round(2 * K[0, 2]) or 1, round(2 * K[1, 2]) or 1)
+    width, height = (max(1, round(float(side))) for side in (size if size is not None else 2 * K[:2, 2]))
     cx, cy = K[0, 2] + 0.5, K[1, 2] + 0.5
     lens = Lens(width, height, K[0, 0], K[1, 1], cx, cy, K[0, 1], radial=(k1, k2, k3), tangential=(p1, p2))
     return Calibrated(lens, world_to_camera(R.T, -R.T @ translation.ravel()), where, size is not None)
