@@ -56,7 +56,6 @@ REMOVED = {
     "loss.dynamics_mode": "the regularization is that of the paper's equation; loss.dynamics 0 turns it off",
     "points.opacity": "it is 0.1",
     "precision": "it is float32",
-    "view": "after Ctrl-C lapgs-view shows the checkpoint, and --resume goes on to the same bytes",
     "schedule.batch": "a step takes one image",
 }
 
