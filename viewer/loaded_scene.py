@@ -33,7 +33,7 @@ class LoadedScene(NamedTuple):
     """path: where it came from, None for a training under way. initial_view: camera, focus, up and frames to
     begin with. file: its content, None for a training, and for moving files of others."""
 
-    path: Path
+    path: Path | None
     playback: Playback
     initial_view: InitialView
     file: SceneFile | None = None
