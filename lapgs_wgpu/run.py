@@ -46,9 +46,9 @@ PROBES = 2048  # points of the scene that say whether a camera sees it
 TRAINING_VIEWS = 8  # that are measured during the training where there are no validation views
 OUTSIDE = 0.05  # warn if this share of the Gaussians, or more, is outside the encoder's box
 
-# Takes over a training's steps, such as a viewer does: called with the scene, where to look at it from, and the steps,
-# of which it takes as many as it likes, each one a step of the training. The rest follows when it returns.
-Watch = Callable[[Scene4D, InitialView, Iterator[StepResult]], None]
+# Takes over a training's steps, such as a viewer does: called with the checkpoint's path, the scene, where to look at
+# it from, and the steps, of which it takes as many as it likes, each one a step. The rest follows when it returns.
+Watch = Callable[[Path, Scene4D, InitialView, Iterator[StepResult]], None]
 
 
 def train(
@@ -161,7 +161,7 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
             training.callbacks.append(partial(_save_now_and_then, out))
         steps = _steps(training, out, interrupted)
         if watch is not None:
-            watch(scene, training.initial_view, steps)
+            watch(out / "checkpoint.ply", scene, training.initial_view, steps)
         for _ in steps:
             pass
         if not training.whole:  # nothing of it may be saved

@@ -182,8 +182,9 @@ def test_an_error_of_a_watched_step_reaches_the_caller(device: Device, monkeypat
     monkeypatch.setattr(live.window, "make_canvas", lambda *_: (canvas, loop))
     interrupt = signal.getsignal(signal.SIGINT)
     try:
+        initial_view = InitialView(CAMERA, np.zeros(3), np.array([0.0, 0, 1]), 9)
         with pytest.raises(NumericalError, match="the loss is nan"):
-            live.watch(trained(device, GRID4D, 20), InitialView(CAMERA, np.zeros(3), np.array([0.0, 0, 1]), 9), steps())
+            live.watch(Path("checkpoint.ply"), trained(device, GRID4D, 20), initial_view, steps())
     finally:
         signal.signal(signal.SIGINT, interrupt)
     assert canvas.get_closed()

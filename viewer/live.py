@@ -11,6 +11,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from types import FrameType
 
 from rendercanvas.utils.asyncs import sleep
@@ -34,13 +35,15 @@ def check_window() -> None:
     window.check_window("leave out --view")
 
 
-def watch(scene: Scene4D, initial_view: InitialView, steps: Iterator[TrainingStep]) -> None:
+def watch(path: Path, scene: Scene4D, initial_view: InitialView, steps: Iterator[TrainingStep]) -> None:
     """Show the scene in a window and take the training's steps, until the window is closed.
+
+    path: of the checkpoint, once there is one.
 
     An error of a step closes the window and goes on to the caller.
     """
     canvas, loop = window.make_canvas("training - lapgs-train", (1280, 720))
-    app = App(canvas, loop, LoadedScene(None, TorchPlayback(scene), initial_view))
+    app = App(canvas, loop, LoadedScene(path, TorchPlayback(scene), initial_view))
     state, viewport = app.state, app.viewport
     state.training = training = TrainingControl()
     interrupt = signal.getsignal(signal.SIGINT)

@@ -30,10 +30,10 @@ _FRAMES = 150  # of a clip whose file does not say how many it has
 
 
 class LoadedScene(NamedTuple):
-    """path: where it came from, None for a training under way. initial_view: camera, focus, up and frames to
+    """path: where it came from; of a training under way, its checkpoint. initial_view: camera, focus, up and frames to
     begin with. file: its content, None for a training, and for moving files of others."""
 
-    path: Path | None
+    path: Path
     playback: Playback
     initial_view: InitialView
     file: SceneFile | None = None
