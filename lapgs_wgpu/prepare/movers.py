@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from lapgs_wgpu.data.images import Size
 from lapgs_wgpu.prepare.flow import REACH, Motion, Plane
 from lapgs_wgpu.prepare.masks import Mask
-from lapgs_wgpu.prepare.measures import Floats
-from lapgs_wgpu.prepare.poses import Match, import_cv2
+from lapgs_wgpu.prepare.poses import Floats, Match, import_cv2
 
 NOISE, NOISE_GROWS = 0.15, 0.05  # pixels of flow, at least: between neighbouring images; for each further one
 QUARTER, MEDIAN = 25, 1.55  # percentile of the errors that tells the noise; a median of noise beside it
@@ -32,7 +31,6 @@ HALO = 1.5  # times the error that parts what moves from the rest: flow bends ar
 SHARP = 2.5  # times the noise of the better of two reconstructions: it agrees
 LITTLE = 0.002  # share of an image: a smaller mask is noise
 AROUND, INSIDE = 10, 5  # pixels around what moves, where colors decide; within it, where they do not
-CUTS = 2  # of GrabCut
 MIDDLE = 0.7  # of width and height, that a reconstruction of the rims leaves out
 
 
@@ -198,7 +196,7 @@ def _cut(image: NDArray[np.uint8], vote: Plane, limit: float) -> Mask:
     label[moves > 0] = cv2.GC_PR_FGD
     label[cv2.erode((value > limit + np.log(2)).astype(np.uint8), disk(INSIDE)) > 0] = cv2.GC_FGD
     if (label == cv2.GC_BGD).any():
-        cv2.grabCut(image, label, None, np.zeros((1, 65)), np.zeros((1, 65)), CUTS, cv2.GC_INIT_WITH_MASK)
+        cv2.grabCut(image, label, None, np.zeros((1, 65)), np.zeros((1, 65)), 1, cv2.GC_INIT_WITH_MASK)
     inside = ((label == cv2.GC_FGD) | (label == cv2.GC_PR_FGD)).astype(np.uint8)
     return cv2.morphologyEx(inside, cv2.MORPH_OPEN, disk(1)) > 0
 

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.images import Size
-from lapgs_wgpu.prepare.measures import Floats
-from lapgs_wgpu.prepare.poses import Match
+from lapgs_wgpu.prepare.poses import Floats, Match
 
 MATCHES = 40  # of a pair of images
 SIGMA = 1.5e-3  # of the longer side: residual from which on a match counts little

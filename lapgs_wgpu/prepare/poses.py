@@ -213,9 +213,9 @@ def nearest(one: NDArray[np.float32], other: NDArray[np.float32]) -> Ints:
         return np.zeros((0, 2), np.int64)
     alike, rows = one @ other.T, np.arange(len(one))
     match = alike.argmax(axis=1)
-    best, back = alike[rows, match], alike.argmax(axis=0)
+    best, back = alike[rows, match], alike.max(axis=0)
     alike[rows, match] = -1
-    kept = (back[match] == rows) & (np.maximum(1 - best, 1e-6) < RATIO**2 * (1 - alike.max(axis=1))) & (best > LIKE)
+    kept = (best == back[match]) & (np.maximum(1 - best, 1e-6) < RATIO**2 * (1 - alike.max(axis=1))) & (best > LIKE)
     return np.stack([rows[kept], match[kept]], axis=1)
 
 

@@ -13,16 +13,16 @@ from PIL import Image
 from lapgs_wgpu.data.images import Size
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.prepare.masks import Mask
-from lapgs_wgpu.prepare.measures import path_faults
 from lapgs_wgpu.prepare.movers import without
 from lapgs_wgpu.prepare.pan import RADIUS, Pan, rays, solve_pan
+from lapgs_wgpu.prepare.path import path_faults
 from lapgs_wgpu.prepare.poses import Match, Reconstruction, import_pycolmap, reconstruction
 from lapgs_wgpu.progress import say
 
 FOCALS = 1.0, 1.4, 0.7  # times the width, where EXIF says nothing
 PURE, NEARLY = 0.8, 0.6  # share of the verified matches that turning alone explains: a pan; one, if nothing else fits
 GOOD, SHARP = 0.95, 1.5e-3  # the search ends: share of the images, and the mean error in parts of the longer side
-SECONDS, SECONDS_EACH, CORES = 60.0, 2.0, 2  # of the search: for any film, and for each image, on so many cores
+SECONDS, SECONDS_EACH, CORES = 30.0, 1.0, 2  # of the search: for any film, and for each image, on so many cores
 BENT = 0.4  # first radial coefficient of a lens, at most
 PANORAMA = 3000  # points of a pan
 
