@@ -54,10 +54,12 @@ class Film:
 
     size: (width, height) of the upright frames, in pixels that are square. seconds: length as the header states it, 0
     if it does not. rate: frames a second, about. keeps_all: whether somebody chose the frames already.
+    start: seconds into the film, at which its frames begin to count.
     notes: what the user should know of the file, one sentence each; `frames` adds to them while it decodes.
     """
 
     keeps_all = False
+    start = 0.0
 
     def __init__(self, path: Path) -> None:
         """Read the header. Raises InputError."""
@@ -110,8 +112,9 @@ class Film:
                     if number and seconds <= last:  # no time stamp, or one that was there before
                         guessed, seconds = True, last + 1 / rate
                     seconds = max(seconds, 0.0)
-                    gray = _gray(frame, shown, shape)
-                    yield Frame(seconds, gray, partial(_pixels, frame, shown, shape))
+                    if seconds >= self.start - 0.5 / rate:
+                        counted = max(seconds - self.start, 0.0)
+                        yield Frame(counted, _gray(frame, shown, shape), partial(_pixels, frame, shown, shape))
                     number, last = number + 1, seconds
         except (av.error.FFmpegError, OSError) as error:
             if number < 2:
