@@ -79,7 +79,6 @@ def test_a_good_walk(pictures, tmp_path: Path) -> None:
     assert not found.still
     assert [m.name for m in found.measures if not m.good] == []
     assert found.measure("moving share").number == pytest.approx(masks.mean(), abs=0.005)
-    assert 40 < found.measure("coverage").number < 65  # walk() turns by 1 radian
     assert 20 < found.measure("parallax").number <= 65
     assert found.measure("exposure").number < 0.1
     assert str(found.measure("parallax")).startswith(" good  parallax: ")
@@ -96,7 +95,6 @@ def test_a_camera_that_turns_on_the_spot(pictures, tmp_path: Path) -> None:
     parallax = measured(tmp_path, "parallax")
     assert parallax.good is False
     assert parallax.number == pytest.approx(np.degrees(0.11 / 5.5), rel=0.4)
-    assert measured(tmp_path, "coverage").good is False
 
 
 def test_share_that_moves(pictures, tmp_path: Path) -> None:
@@ -159,7 +157,7 @@ def test_the_report_needs_no_other_file(pictures, tmp_path: Path) -> None:
     assert len(re.findall(r'<circle cx="[\d.]+" cy="[\d.]+" r="3" fill="[^"]+"/>', page)) == COUNT
     assert not re.findall(r'(?:src|href)="(?!data:)', page)
     assert "what moves in red" in page
-    for name in ("parallax", "path", "moving share", "coverage", "exposure"):
+    for name in ("parallax", "path", "moving share", "exposure"):
         assert f"good  {name}: " in page
 
 
@@ -169,7 +167,7 @@ def test_check_prints_and_writes(pictures, tmp_path: Path, capsys: pytest.Captur
     for _ in range(2):  # the page of an earlier run is replaced
         assert prepare_command(["--check", str(folder)]) == 0
         said = capsys.readouterr()
-        assert said.out.count("(wanted: ") == 5
+        assert said.out.count("(wanted: ") == 4
         assert "note: " not in said.err
     (folder / "report.html").write_text("<title>mine</title>")
     assert prepare_command(["--check", str(folder)]) == 0

@@ -93,9 +93,9 @@ def diagnose(folder: Path) -> Diagnosis:
     looks = _looks(folder, views, cameras if still else None)
     measures = [parallax(cameras, points), moving_share(looks)]
     if still:
-        measures.append(coverage_of_still(looks))
+        measures.append(coverage(looks))
     else:
-        measures += [path(views, points), coverage_of_moving(cameras, points)]
+        measures.append(path(views, points))
         measures.append(exposure(looks, points if dataset.cloud is not None else None))
     return Diagnosis(dataset, still, measures, looks)
 
@@ -153,7 +153,8 @@ def parallax(cameras: Sequence[Camera], points: Floats) -> Measure:
     several = seen.sum(axis=0) > 1
     degrees = float(np.median(np.degrees(np.arccos(np.clip(least[several], -1, 1))))) if several.any() else 0.0
     value = f"{degrees:.1f} degrees between the two cameras furthest apart that see a point"
-    advice = "walk around what moves instead of turning on the spot, or put the cameras further apart: depth is a guess"
+    advice = "walk (further) around what moves instead of turning on the spot, or put the cameras further apart: depth "
+    advice += "is a guess, and the other sides stay empty"
     # Half a pixel of a phone's image is 1 % of the depth at 5 degrees.
     return Measure("parallax", degrees, value, 5, math.inf, "5 or more", advice)
 
@@ -183,7 +184,7 @@ def moving_share(looks: Sequence[Look]) -> Measure:
     return Measure("moving share", share, value, LITTLE, 0.5, "1% to 50%", advice)
 
 
-def coverage_of_still(looks: Sequence[Look]) -> Measure:
+def coverage(looks: Sequence[Look]) -> Measure:
     """Of cameras that stand still: how many see something move at one time."""
     counts: dict[float, int] = {}  # of cameras that see something move, by time
     for look in looks:
@@ -193,16 +194,6 @@ def coverage_of_still(looks: Sequence[Look]) -> Measure:
     advice = "aim more cameras at what moves: where less than three see it, its place in depth is a guess"
     value = f"{cameras:g} cameras see something move at one time"
     return Measure("coverage", cameras, value, 3, math.inf, "3 or more", advice)
-
-
-def coverage_of_moving(cameras: Sequence[Camera], points: Floats) -> Measure:
-    """Of a camera that moves: the angle that it goes around the middle of the scene."""
-    away = np.stack([camera.position for camera in cameras]) - np.median(points, axis=0)
-    directions = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
-    degrees = float(np.degrees(np.arccos(np.clip((directions @ directions.T).min(), -1, 1))))
-    advice = "walk further around what moves: its other sides stay empty, and few views of each side tell its depth"
-    value = f"the camera goes {degrees:.0f} degrees around the scene"
-    return Measure("coverage", degrees, value, 20, math.inf, "20 or more", advice)
 
 
 def exposure(looks: Sequence[Look], points: Floats | None) -> Measure:

@@ -6,6 +6,7 @@ import itertools
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -229,26 +230,23 @@ def neighbouring_pairs(names: Sequence[str]) -> list[Pair]:
 
 def import_pycolmap() -> Any:
     """The module pycolmap, which logs nothing. Raises InputError where it is not installed."""
-    try:
-        import pycolmap
-    except ImportError:
-        raise InputError(
-            f"pycolmap, which finds out where the cameras stood, is not installed: {pip_install('prepare')}."
-        ) from None
-    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
-    return pycolmap
+    module = _imported("pycolmap", "pycolmap, which finds out where the cameras stood")
+    module.logging.minloglevel = int(module.logging.FATAL)
+    return module
 
 
 def import_cv2() -> Any:
     """The module cv2 of OpenCV. Raises InputError where it is not installed."""
+    module = _imported("cv2", "OpenCV, which finds and follows features")
+    module.setRNGSeed(0)
+    return module
+
+
+def _imported(name: str, what: str) -> Any:
     try:
-        import cv2
+        return import_module(name)
     except ImportError:
-        raise InputError(
-            f"OpenCV, which finds and follows features, is not installed: {pip_install('prepare')}."
-        ) from None
-    cv2.setRNGSeed(0)
-    return cv2
+        raise InputError(f"{what}, is not installed: {pip_install('prepare')}.") from None
 
 
 def merged(source: Reconstruction, matches: Match, groups: Sequence[Sequence[str]], work: Path) -> Reconstruction:
