@@ -121,12 +121,20 @@ def test_what_a_refusal_has_found_stays(film: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("film.mp4", ""), ("folder", ""), ("none.mp4", ""), ("film.zip", ""), ("*.webp", ""), ("a.heic", ".*pillow-heif")],
+    [
+        ("film.mp4", ""),
+        ("folder", ""),
+        ("none.mp4", ""),
+        ("film.zip", ""),
+        ("*.webp", ""),
+        ("phone", "/1.heic.*pillow-heif"),
+    ],
 )
 def test_what_is_no_film(name: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for file in ("film.mp4", "film.zip", "a.heic", "b.heic"):
+    for folder in ("folder", "phone"):
+        (tmp_path / folder).mkdir()
+    for file in ("film.mp4", "film.zip", "phone/1.heic", "phone/2.heic"):
         (tmp_path / file).write_text("hello")
-    (tmp_path / "folder").mkdir()
     monkeypatch.setattr("lapgs_wgpu.prepare.inputs.HEIC", "no_such_module")
     with pytest.raises(InputError, match=re.escape(name) + words):
         prepare([tmp_path / name], tmp_path / "out")
