@@ -112,6 +112,8 @@ def test_what_a_hand_does_not_do() -> None:
     assert [i for what, i in path_faults(stalled, axes, points, names) if "stalls" in what] == [5]
     shaken = places[0] + np.random.default_rng(1).normal(size=(20, 3)) * 1e-4  # of a tripod
     assert path_faults(shaken, axes, points, names) == []
+    pan = places[0] + np.where(np.arange(20) % 7 < 3, 1e-16, 0.0)[:, None]
+    assert path_faults(pan, axes, points, names) == []
 
 
 def test_the_part_that_fits() -> None:

@@ -31,7 +31,7 @@ def path_faults(places: Floats, axes: Floats, points: Floats, names: Sequence[st
     turn = max(float(np.median(turns)), 0.5)
     cosine = (steps[1:] * steps[:-1]).sum(axis=1) / np.maximum(length[1:] * length[:-1], 1e-12)
     back = (cosine < -0.5) & (np.minimum(length[1:], length[:-1]) > max(usual, 1e-2 * away))
-    still = length < 0.02 * float(np.median(length))
+    still = length < (0.02 * usual if np.median(length) == usual else 0.0)
     long = max(3, len(still) // 10)
     stalls = [i for i in range(len(still) - long + 1) if still[i : i + long].all()][:1]
     faults = [(f"a step of {length[i] / usual:.0f} times the usual one", i + 1) for i in _where(length > STEP * usual)]
