@@ -75,7 +75,8 @@ class Film:
                     raise InputError(f"{path} is in a format that PyAV cannot decode; convert it to H.264.")
                 coded = (int(stream.width), int(stream.height))
                 self._aspect = pixel_aspect(stream)
-                self.seconds = _seconds(stream, file)
+                length = stream.duration and stream.time_base and stream.duration * stream.time_base
+                self.seconds = float(length or (file.duration or 0) / 1e6)  # of the container: microseconds
                 self.rate = float(stream.average_rate or stream.guessed_rate or 30.0)
         except (av.error.FFmpegError, OSError) as error:
             raise InputError(f"{path} is not a readable film ({error}); copy or record it again.") from None
@@ -144,12 +145,6 @@ class Film:
         if not streams:
             raise InputError(f"{self.path} has no video stream; give the camera's recording.")
         return max(streams, key=lambda s: (s.width or 0) * (s.height or 0))
-
-
-def _seconds(stream: Any, file: Any) -> float:
-    if stream.duration is not None and stream.time_base is not None:
-        return float(stream.duration * stream.time_base)
-    return file.duration / 1e6 if file.duration is not None else 0.0  # of the container: microseconds
 
 
 def _squared(coded: Size, aspect: float) -> Size:

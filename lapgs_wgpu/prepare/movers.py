@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.images import Size
-from lapgs_wgpu.prepare.flow import REACH, Motion, Plane
+from lapgs_wgpu.prepare.flow import REACH, Motion
 from lapgs_wgpu.prepare.masks import Mask
-from lapgs_wgpu.prepare.poses import Floats, Match, import_cv2
+from lapgs_wgpu.prepare.poses import Floats, Match, Plane, import_cv2
 
 NOISE, NOISE_GROWS = 0.15, 0.05  # pixels of flow, at least: between neighbouring images; for each further one
 QUARTER, MEDIAN = 25, 1.55  # percentile of the errors that tells the noise; a median of noise beside it
