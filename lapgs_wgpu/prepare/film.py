@@ -54,7 +54,7 @@ class Film:
 
     size: (width, height) of the upright frames, in pixels that are square. seconds: length as the header states it, 0
     if it does not. rate: frames a second, about. keeps_all: whether somebody chose the frames already.
-    start: seconds into the film, at which its frames begin to count.
+    start: seconds into the film, of which the nearest frame becomes the first one.
     notes: what the user should know of the file, one sentence each; `frames` adds to them while it decodes.
     """
 
@@ -90,7 +90,7 @@ class Film:
         """Decode the frames in the order of their times. Raises InputError; a film that is damaged after its first
         frames ends there, with a note."""
         av = import_av(self.path)
-        number, first, last, guessed, rate = 0, 0.0, -1.0, False, self.rate
+        number, first, last, guessed, rate, begin = 0, 0.0, -1.0, False, self.rate, None
         try:
             with av.open(str(self.path), metadata_errors="replace") as file:
                 stream = self._stream(file)
@@ -114,8 +114,8 @@ class Film:
                         guessed, seconds = True, last + 1 / rate
                     seconds = max(seconds, 0.0)
                     if seconds >= self.start - 0.5 / rate:
-                        counted = max(seconds - self.start, 0.0)
-                        yield Frame(counted, _gray(frame, shown, shape), partial(_pixels, frame, shown, shape))
+                        begin = seconds if begin is None else begin
+                        yield Frame(seconds - begin, _gray(frame, shown, shape), partial(_pixels, frame, shown, shape))
                     number, last = number + 1, seconds
         except (av.error.FFmpegError, OSError) as error:
             if number < 2:
