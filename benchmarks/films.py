@@ -134,7 +134,7 @@ def davis(folder: Path, captures: Path, films: list[str]) -> None:
             print(f"| {film} | | refused | | | | {seconds} |", flush=True)
             continue
         faults = next(line for line in done.stdout.splitlines() if "path: " in line)
-        kind = "a pan" if "turns on the spot" in done.stdout else faults.split("path: ")[1].split(" (wanted")[0]
+        kind = "a pan" if "placed as a pan" in done.stdout else faults.split("path: ")[1].split(" (wanted")[0]
         model = pycolmap.Reconstruction(str(out / "sparse" / "0"))
         overlaps, shares = [], []
         masks = sorted((out / "masks").glob("*.png"))

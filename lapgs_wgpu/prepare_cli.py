@@ -54,7 +54,7 @@ def options() -> Parser:
         "(transforms.json), Qualisys (.qca.txt), Pose2Sim (.toml), OpenCV (.yml) or Panoptic (.json); each film is "
         "named as its camera. Images are undistorted, and no training changes these cameras")
     add("--check", metavar="DIR", help="instead of films: measure the existing capture in DIR, of any format that "
-        "lapgs-train reads, print parallax, motion, coverage, blur and exposure, and write DIR/report.html. "
+        "lapgs-train reads, print parallax, path, motion, coverage and exposure, and write DIR/report.html. "
         "Can be combined with --train and --minutes only")
     add("--train", action="store_true", help="then train. Preset, image size and number of steps are chosen from the "
         "graphics adapter, the capture and a short measurement; the run folder is runs/NAME, NAME that of the capture")
@@ -113,8 +113,8 @@ def _convert(given: argparse.Namespace, out: Path) -> None:
     paths = {name: Path(value) for name in ("masks", "poses", "calibration") if (value := getattr(given, name))}
     try:
         done = prepare([Path(film) for film in given.films], out, fps=given.fps, **paths)
-    except RefusedError:
-        write_refusal(out)
+    except RefusedError as error:
+        write_refusal(out, str(error))
         raise
     print(f"{out}: {done.images} images, {done.placed} of {done.cameras} cameras placed", flush=True)
 
@@ -128,7 +128,7 @@ def _measure(folder: Path) -> Diagnosis:
     diagnosis = diagnose(folder)
     print(f"{folder}: {diagnosis}", flush=True)
     try:
-        write_report(diagnosis, folder / REPORT, folder.resolve().name)
+        write_report(folder, diagnosis)
         print(f"{folder / REPORT} shows it with pictures", flush=True)
     except InputError as error:  # a training can follow all the same
         print(f"note: {error}", file=sys.stderr, flush=True)
@@ -142,7 +142,7 @@ def _train(capture: Path, run: Path, minutes: float | None, diagnosis: Diagnosis
     from lapgs_wgpu.train.run_folder import result_text
 
     device = open_device()
-    exposure = diagnosis.measure("exposure").good is False
+    exposure = (measure := diagnosis.measure("exposure")) is not None and measure.good is False
     print("measuring some steps on this machine ...", file=sys.stderr, flush=True)
     plan = plan_training(capture, diagnosis.dataset, device, minutes=minutes, exposure=exposure)
     print(plan.text, flush=True)

@@ -10,11 +10,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers.films import Board, drawn, walk
-from PIL import Image, ImageFilter
+from PIL import Image
 
 from lapgs_wgpu.command import beside
-from lapgs_wgpu.prepare.diagnosis import _mask, diagnose
-from lapgs_wgpu.prepare.measures import Measure, blur
+from lapgs_wgpu.prepare.diagnosis import Measure, _mask, diagnose
 from lapgs_wgpu.prepare.report import write_report
 from lapgs_wgpu.prepare_cli import prepare_command
 from lapgs_wgpu.splat.camera import Camera
@@ -68,7 +67,9 @@ def write_masks(folder: Path, masks: np.ndarray) -> None:
 
 
 def measured(folder: Path, name: str) -> Measure:
-    return diagnose(folder).measure(name)
+    measure = diagnose(folder).measure(name)
+    assert measure is not None
+    return measure
 
 
 def test_a_good_walk(pictures, tmp_path: Path) -> None:
@@ -78,7 +79,6 @@ def test_a_good_walk(pictures, tmp_path: Path) -> None:
     assert not found.still
     assert [m.name for m in found.measures if not m.good] == []
     assert found.measure("moving share").number == pytest.approx(masks.mean(), abs=0.005)
-    assert 40 < found.measure("coverage").number < 65  # walk() turns by 1 radian
     assert 20 < found.measure("parallax").number <= 65
     assert found.measure("exposure").number < 0.1
     assert str(found.measure("parallax")).startswith(" good  parallax: ")
@@ -95,7 +95,6 @@ def test_a_camera_that_turns_on_the_spot(pictures, tmp_path: Path) -> None:
     parallax = measured(tmp_path, "parallax")
     assert parallax.good is False
     assert parallax.number == pytest.approx(np.degrees(0.11 / 5.5), rel=0.4)
-    assert measured(tmp_path, "coverage").good is False
 
 
 def test_share_that_moves(pictures, tmp_path: Path) -> None:
@@ -110,16 +109,6 @@ def test_share_that_moves(pictures, tmp_path: Path) -> None:
     for path in (folder / "masks").iterdir():
         Image.fromarray(np.full((9, 12), 255, np.uint8)).save(path)
     assert measured(folder, "moving share").good is False
-
-
-def test_blur(pictures, tmp_path: Path) -> None:
-    cameras, images, _ = pictures
-    soft = [np.asarray(Image.fromarray(image).filter(ImageFilter.GaussianBlur(2))) for image in images]
-    sharp, blurred = blur(images[0].mean(axis=2)), blur(soft[0].mean(axis=2))
-    assert 0 < sharp < 0.4 < 0.5 < blurred < 1
-    assert blur(np.full((20, 20), 7.0)) == 1.0
-    found = measured(write_capture(tmp_path, cameras, soft), "blur")
-    assert found.good is False
 
 
 def test_exposure_is_told_from_what_the_camera_sees(pictures, tmp_path: Path) -> None:
@@ -151,25 +140,25 @@ def test_still_cameras(tmp_path: Path, seeing: int) -> None:
     assert found.measure("coverage").number == seeing
     assert found.measure("coverage").good is (seeing >= 3)
     assert found.measure("moving share").number > 0.003 * seeing
-    assert found.measure("exposure").number < 0.1
+    assert found.measure("exposure") is None
     assert "4 cameras that stand still" in str(found)
 
 
 def test_the_report_needs_no_other_file(pictures, tmp_path: Path) -> None:
     cameras, images, masks = pictures
-    folder = write_capture(tmp_path / "x", cameras, images)
+    folder = write_capture(tmp_path / "<walk> & more", cameras, images)
     write_masks(folder, masks)
-    write_report(diagnose(folder), tmp_path / "report.html", "<walk> & more")
-    page = (tmp_path / "report.html").read_text()
+    write_report(folder, diagnose(folder))
+    page = (folder / "report.html").read_text()
     assert "&lt;walk&gt; &amp; more" in page
     assert "<walk>" not in page
     assert page.count("data:image/jpeg;base64,") == COUNT
     assert page.count("<svg") == 1
-    assert len(re.findall(r'<circle cx="[\d.]+" cy="[\d.]+" r="3"/>', page)) == COUNT
+    assert len(re.findall(r'<circle cx="[\d.]+" cy="[\d.]+" r="3" fill="[^"]+"/>', page)) == COUNT
     assert not re.findall(r'(?:src|href)="(?!data:)', page)
     assert "what moves in red" in page
-    for name in ("parallax", "path", "moving share", "coverage", "blur", "exposure"):
-        assert f"<td>{name}</td>" in page
+    for name in ("parallax", "path", "moving share", "exposure"):
+        assert f"good  {name}: " in page
 
 
 def test_check_prints_and_writes(pictures, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -178,7 +167,7 @@ def test_check_prints_and_writes(pictures, tmp_path: Path, capsys: pytest.Captur
     for _ in range(2):  # the page of an earlier run is replaced
         assert prepare_command(["--check", str(folder)]) == 0
         said = capsys.readouterr()
-        assert said.out.count("(wanted: ") == 6
+        assert said.out.count("(wanted: ") == 4
         assert "note: " not in said.err
     (folder / "report.html").write_text("<title>mine</title>")
     assert prepare_command(["--check", str(folder)]) == 0
@@ -200,9 +189,9 @@ def test_train_goes_on_to_a_scene(
     pictures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     """With so little time that a few steps are left; the line that ends it opens the scene."""
-    cameras, images, masks = pictures
+    cameras, images, _ = pictures
     dark = [(image * (0.6 if i >= COUNT // 2 else 1)).astype(np.uint8) for i, image in enumerate(images)]
-    write_masks(write_capture(tmp_path / "walk", cameras, dark), masks)
+    write_capture(tmp_path / "walk", cameras, dark)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(plan, "LEAST_STEPS", 10)
     monkeypatch.setitem(plan.plan_training.__kwdefaults__, "measure", lambda *_: 0.1)

@@ -18,6 +18,7 @@ from lapgs_wgpu.prepare.film import Film
 from lapgs_wgpu.prepare.hdr import Transfer, to_sdr
 from lapgs_wgpu.prepare.images import Picture, common_times, extract, extract_in_step, images_per_second
 from lapgs_wgpu.prepare.rig import shapes_of
+from lapgs_wgpu.prepare.sound import start_together
 
 av = pytest.importorskip("av")
 
@@ -148,6 +149,33 @@ def test_films_of_still_cameras_are_taken_in_step(tmp_path: Path) -> None:
         names = [f"cam{number:02d}/{100 * i:08d}.jpg" for i in range(4)]
         assert [picture.name for picture in pictures] == names
         assert sorted(path.name for path in (tmp_path / f"images/cam{number:02d}").iterdir()) == [n[6:] for n in names]
+
+
+def test_films_are_brought_into_step_by_their_sound(tmp_path: Path, capfd: pytest.CaptureFixture) -> None:
+    """The second film begins 0.4 s later; a third one heard something else."""
+    rng = np.random.default_rng(0)
+    claps = rng.normal(size=24000) * np.repeat(rng.random(120) ** 6, 200)
+    other = rng.normal(size=24000) * np.repeat(rng.random(120) ** 6, 200)
+    films = []
+    for number, (sound, begin) in enumerate(((claps, 0.0), (claps, 0.4), (other, 0.0))):
+        with av.open(str(tmp_path / f"{number}.mp4"), "w") as file:
+            video, audio = file.add_stream("libx264", rate=30), file.add_stream("aac", rate=8000, layout="mono")
+            video.width, video.height, video.pix_fmt = 64, 48, "yuv420p"
+            for picture in noise_pictures(60):
+                file.mux(video.encode(av.VideoFrame.from_ndarray(picture, "rgb24")))
+            heard = sound[round(8000 * begin) :][:16000] + 0.001 * rng.normal(size=16000)
+            frame = av.AudioFrame.from_ndarray(heard.astype(np.float32)[None], "fltp", "mono")
+            frame.rate = 8000
+            file.mux([*audio.encode(frame), *audio.encode(), *video.encode()])
+        films.append(Film(tmp_path / f"{number}.mp4"))
+    start_together(films[:2])
+    assert [film.start for film in films[:2]] == pytest.approx([0.4, 0.0], abs=0.01)
+    assert "by their sound" in capfd.readouterr().out
+    found = [[frame.seconds for frame in film.frames()] for film in films[:2]]
+    assert found[0] == pytest.approx(np.arange(48) / 30, abs=1e-3)
+    assert found[1] == pytest.approx(np.arange(60) / 30, abs=1e-3)
+    start_together([films[1], films[2]])
+    assert "2.mp4 has no sound in common with 1.mp4" in capfd.readouterr().out
 
 
 def test_films_of_other_sizes_get_one(tmp_path: Path) -> None:

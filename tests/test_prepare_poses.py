@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.prepare.capture import prepare
 from lapgs_wgpu.prepare.images import images_per_second
-from lapgs_wgpu.prepare.measures import path_faults
 from lapgs_wgpu.prepare.pan import rays, solve_pan
+from lapgs_wgpu.prepare.path import path_faults
 from lapgs_wgpu.prepare.poses import nearest
 from lapgs_wgpu.prepare.search import longest_part
 from lapgs_wgpu.splat.camera import Camera
@@ -112,6 +112,8 @@ def test_what_a_hand_does_not_do() -> None:
     assert [i for what, i in path_faults(stalled, axes, points, names) if "stalls" in what] == [5]
     shaken = places[0] + np.random.default_rng(1).normal(size=(20, 3)) * 1e-4  # of a tripod
     assert path_faults(shaken, axes, points, names) == []
+    pan = places[0] + np.where(np.arange(20) % 7 < 3, 1e-16, 0.0)[:, None]
+    assert path_faults(pan, axes, points, names) == []
 
 
 def test_the_part_that_fits() -> None:

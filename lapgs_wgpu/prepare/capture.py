@@ -23,9 +23,8 @@ from lapgs_wgpu.prepare.flow import Motion, film_frames
 from lapgs_wgpu.prepare.images import Picture, extract, images_per_second
 from lapgs_wgpu.prepare.inputs import open_inputs
 from lapgs_wgpu.prepare.masks import MASKS, read_masks, write_masks
-from lapgs_wgpu.prepare.measures import Floats
 from lapgs_wgpu.prepare.movers import cut_out, judge, rim, without
-from lapgs_wgpu.prepare.poses import Match, Reconstruction, import_cv2, import_pycolmap, neighbouring_pairs
+from lapgs_wgpu.prepare.poses import Floats, Match, Reconstruction, import_cv2, import_pycolmap, neighbouring_pairs
 from lapgs_wgpu.prepare.rig import place_calibrated, place_still
 from lapgs_wgpu.prepare.search import Found, again, described, longest_part, search
 from lapgs_wgpu.progress import say
@@ -33,7 +32,7 @@ from lapgs_wgpu.progress import say
 # Square pixels: a lens with more freedom bends until things that move seem to stand still.
 LENS = "RADIAL"
 FEWEST, WHOLE = 0.3, 0.9  # of the images need a pose; of fewer than this only a part of the film fits
-LITTLE, MUCH = 0.002, 0.1  # share of the images: less motion needs no masks; more may have led the cameras astray
+LITTLE, MUCH = 0.002, 0.15  # share of the images: less motion needs no masks; more may have led the cameras astray
 FOLLOWED, UNKNOWN = 0.8, 0.2  # share of the image area where flow must tell whether it moves; less makes no masks
 STANDING = 4e-3  # of the longer side: the image of a camera that stands still moves less over the film
 FEATURES, SHARED = 200, 60  # of an image; in common with the next one: fewer say why cameras are not found
@@ -134,10 +133,11 @@ def _moving_camera(
             found, given = _without_movers(source, found, motion, matches, size)
     write_masks(folder / MASKS, given)
     if found.pan is not None:
+        turns = "stands still" if found.pan.travel < STANDING * max(size) else "turns on the spot"
         say(
-            f"the camera turns on the spot: turning alone explains {found.pan.explained:.0%} of what several images "
-            f"show, over {found.pan.travel:.0f} pixels. It is placed as a pan: a panorama at one depth, what moves in "
-            "front of it. Walk while you film if views from other places are wanted."
+            f"the camera {turns}: turning alone explains {found.pan.explained:.0%} of what several images show, over "
+            f"{found.pan.travel:.0f} pixels. It is placed as a pan: a panorama at one depth, what moves in front of "
+            "it. Walk while you film if views from other places are wanted."
         )
     if found.held:
         width = f"{found.focal / size[0]:.1f} of the width"
@@ -200,8 +200,7 @@ def _without_movers(
 def _checked(
     source: Reconstruction, found: Found | None, size: Size, folder: Path, pictures: Sequence[Picture]
 ) -> Found:
-    """Raises RefusedError where too few images have a pose, whose cameras are written, and for a camera that neither
-    walks nor turns."""
+    """Raises RefusedError where too few images have a pose, whose cameras are written."""
     placed, least = len(found.placed) if found else 0, max(2, round(FEWEST * len(source.names)))
     if found is None or placed < least:
         features = int(np.median([len(places) for places in source.places.values()]))
@@ -222,11 +221,5 @@ def _checked(
             f"{placed} of {len(source.names)} images could be placed (at least {least} are needed): an image has "
             f"{features} features, of which {np.median(shared):.0f} fit the next image (medians), fewest, "
             f"{shared[worst]}, from {source.names[worst]} to {source.names[worst + 1]}{part}; {advice}."
-        )
-    if found.pan is not None and found.pan.travel < STANDING * max(size):
-        raise RefusedError(
-            f"the camera stands still: its image moves by {found.pan.travel:.1f} pixels over the film (at least "
-            f"{STANDING * max(size):.1f} are needed), so nothing tells how far away anything is; walk around what "
-            "moves, or film it with several cameras at once."
         )
     return found

@@ -1,53 +1,80 @@
-"""What a capture is worth: a number for each property that decides, its threshold, and what to film differently."""
+"""What a capture is worth: a number for each property that decides, what is wanted, and what to film differently."""
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lapgs_wgpu.data import Dataset, View, load_dataset
-from lapgs_wgpu.data.cloud import points_in_view
+from lapgs_wgpu.data.cloud import in_view, points_in_view
 from lapgs_wgpu.data.evenly import evenly
+from lapgs_wgpu.data.images import Pixels
 from lapgs_wgpu.data.readers.colmap import IMAGES
 from lapgs_wgpu.prepare.masks import MASKS, Mask, read_mask
-from lapgs_wgpu.prepare.measures import (
-    Floats,
-    Look,
-    Measure,
-    blur_measure,
-    coverage_of_moving,
-    coverage_of_still,
-    distinct_cameras,
-    exposure,
-    gray,
-    moving_share,
-    parallax,
-    path,
-)
+from lapgs_wgpu.prepare.path import AROUND, STEP, TURN, path_faults
+from lapgs_wgpu.prepare.poses import Floats
 from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.camera import Camera
 
 SIZE = 320  # longer side of the images that are looked at, pixels
 MOST_VIEWS = 96  # of a capture that are looked at, evenly chosen over the clip
-MOST_POINTS = 1500  # of the scene, at which angles are measured
+MOST_POINTS, MOST_CAMERAS = 1500, 48  # at which, and between which, angles are measured
 LEVELS = 16.0  # of 255 from the median over the clip: the pixel of a still camera moves
+LITTLE = 0.01  # share of the images that moves, at least
+SEEN = 0.002  # share of an image that moves, from which on it shows something that does
+POINTS_SEEN = 30  # in an image whose exposure is measured
+NAMED = 3  # faults of a path
+UNKNOWN = float("nan"), "not measured"
 
 
-@dataclass(frozen=True, eq=False)
-class Diagnosis:
+class Measure(NamedTuple):
+    """One property. number: NaN where it cannot be measured. value: the same as a text with units. least, most: of a
+    good one. wanted: these as a text. advice: what to film differently, or why there is no number."""
+
+    name: str
+    number: float
+    value: str
+    least: float
+    most: float
+    wanted: str
+    advice: str
+
+    @property
+    def good(self) -> bool | None:
+        """None where it cannot be measured."""
+        return None if math.isnan(self.number) else self.least <= self.number <= self.most
+
+    def __str__(self) -> str:
+        mark = {True: "good", False: "POOR", None: "-"}[self.good]
+        text = f"{mark:>5}  {self.name}: {self.value} (wanted: {self.wanted})"
+        return text if self.good else f"{text}. {self.advice[0].upper()}{self.advice[1:]}."
+
+
+class Look(NamedTuple):
+    """A view that was looked at. image: (h, w, 3) RGB. mask: (h', w') of what moves, None where there is none."""
+
+    view: View
+    image: Pixels
+    mask: Mask | None
+
+
+class Diagnosis(NamedTuple):
     """dataset: images of SIZE pixels. still: the cameras stand still. looks: by camera, then time."""
 
     dataset: Dataset
     still: bool
-    measures: tuple[Measure, ...]
-    looks: tuple[Look, ...]
+    measures: list[Measure]
+    looks: list[Look]
 
-    def measure(self, name: str) -> Measure:
-        return next(each for each in self.measures if each.name == name)
+    def measure(self, name: str) -> Measure | None:
+        return next((each for each in self.measures if each.name == name), None)
 
     def __str__(self) -> str:
         views = (*self.dataset.train, *self.dataset.test)
@@ -61,42 +88,39 @@ def diagnose(folder: Path) -> Diagnosis:
     """Measure a capture of any format. Raises InputError where it cannot be opened."""
     dataset = load_dataset(folder, image_size=SIZE)
     views = sorted((*dataset.train, *dataset.test), key=lambda view: view.time)
-    cameras = distinct_cameras(views)
+    cameras, points = distinct_cameras(views), _points(dataset)
     still = len(views) >= 2 * len(cameras)
     looks = _looks(folder, views, cameras if still else None)
-    points = _points(dataset)
-    measures = [
-        parallax(cameras, points),
-        *([] if still else [path(views, points)]),
-        moving_share(looks),
-        coverage_of_still(looks) if still else coverage_of_moving(cameras, points),
-        blur_measure(looks),
-        exposure(looks, points if dataset.cloud is not None else None, still),
-    ]
-    return Diagnosis(dataset, still, tuple(measures), tuple(looks))
+    measures = [parallax(cameras, points), moving_share(looks)]
+    if still:
+        measures.append(coverage(looks))
+    else:
+        measures.append(path(views, points))
+        measures.append(exposure(looks, points if dataset.cloud is not None else None))
+    return Diagnosis(dataset, still, measures, looks)
+
+
+def distinct_cameras(views: Sequence[View]) -> list[Camera]:
+    return list({id(view.camera): view.camera for view in views}.values())
 
 
 def _looks(folder: Path, views: Sequence[View], cameras: Sequence[Camera] | None) -> list[Look]:
     """The images of some views by time, with masks. cameras: those that stand still; then all show the same times."""
-    if cameras is None:
-        chosen = evenly(views, MOST_VIEWS)
-    else:
-        each = [[view for view in views if view.camera is camera] for camera in cameras]
-        times = max(3, MOST_VIEWS // len(cameras))
-        chosen = [view for own in each for view in evenly(own, times)]
-    with ThreadPoolExecutor(4) as pool, Progress(len(chosen), "images looked at") as progress:
-        images = []
-        for image in pool.map(lambda view: view.load()[..., :3], chosen):
-            images.append(image)
-            progress.step()
-    if cameras is None:
-        masks = [_mask(folder, view) for view in chosen]
-    else:
-        masks = []
-        for camera in cameras:
-            levels = np.stack([gray(i) for i, view in zip(images, chosen, strict=True) if view.camera is camera])
-            masks += list(np.abs(levels - np.median(levels, axis=0)) > LEVELS)
-    return [Look(*each) for each in zip(chosen, images, masks, strict=True)]
+    groups = [views] if cameras is None else [[view for view in views if view.camera is camera] for camera in cameras]
+    chosen = [evenly(group, max(3, MOST_VIEWS // len(groups))) for group in groups]
+    looks: list[Look] = []
+    with ThreadPoolExecutor(4) as pool, Progress(sum(map(len, chosen)), "images looked at") as progress:
+        for group in chosen:
+            images = []
+            for image in pool.map(lambda view: view.load()[..., :3], group):
+                images.append(image)
+                progress.step()
+            masks: list[Mask | None] = [_mask(folder, view) for view in group]
+            if cameras is not None:
+                levels = np.stack([_gray(image) for image in images])
+                masks = list(np.abs(levels - np.median(levels, axis=0)) > LEVELS)
+            looks += map(Look, group, images, masks)
+    return looks
 
 
 def _mask(folder: Path, view: View) -> Mask | None:
@@ -110,10 +134,96 @@ def _mask(folder: Path, view: View) -> Mask | None:
 
 def _points(dataset: Dataset) -> Floats:
     """(N, 3) points of the scene: of its cloud, else random ones where views overlap, else what cameras look at."""
-    random = np.random.default_rng(0)
     if dataset.cloud is not None:
-        points = dataset.cloud.points
-        return points[random.permutation(len(points))[:MOST_POINTS]].astype(np.float64)
+        return dataset.cloud.at_most(MOST_POINTS, 0).points.astype(np.float64)
     if dataset.depths is not None:
         return points_in_view(dataset.cameras, *dataset.depths, MOST_POINTS, 0).astype(np.float64)
     return dataset.focus[None]
+
+
+def parallax(cameras: Sequence[Camera], points: Floats) -> Measure:
+    """The largest angle between two cameras that see a point, the median over the points."""
+    chosen = evenly(cameras, MOST_CAMERAS)
+    seen = np.stack([in_view(points, camera)[1] for camera in chosen])
+    away = points - np.stack([camera.position for camera in chosen])[:, None]
+    rays = np.where(seen[..., None], away / np.maximum(np.linalg.norm(away, axis=2, keepdims=True), 1e-12), np.nan)
+    least = np.ones(len(points))
+    for ray in rays:
+        least = np.fmin(least, np.fmin.reduce(np.einsum("cni,ni->cn", rays, ray), axis=0))
+    several = seen.sum(axis=0) > 1
+    degrees = float(np.median(np.degrees(np.arccos(np.clip(least[several], -1, 1))))) if several.any() else 0.0
+    value = f"{degrees:.1f} degrees between the two cameras furthest apart that see a point"
+    advice = "walk (further) around what moves instead of turning on the spot, or put the cameras further apart: depth "
+    advice += "is a guess, and the other sides stay empty"
+    # Half a pixel of a phone's image is 1 % of the depth at 5 degrees.
+    return Measure("parallax", degrees, value, 5, math.inf, "5 or more", advice)
+
+
+def path(views: Sequence[View], points: Floats) -> Measure:
+    """Of a camera that moves: whether its path is one that a hand can walk."""
+    places = np.stack([view.camera.position for view in views])
+    axes = np.stack([view.camera.T_cam_world[2, :3] for view in views])
+    faults = path_faults(places, axes, points, [view.source for view in views])
+    named = ", ".join(f"{what} at {Path(views[i].source).name}" for what, i in faults[:NAMED])
+    more = f" and {len(faults) - NAMED} more" if len(faults) > NAMED else ""
+    wanted = f"no step above {STEP:g} and no turn above {TURN:g} times the usual one, no doubling back or stall, at "
+    wanted += f"most {AROUND:g} degrees a second around the scene"
+    advice = "the cameras are likely wrong there: cut the film at these images, or film that part more slowly"
+    return Measure("path", len(faults), f"{named}{more}" or "smooth", 0, 0, wanted, advice)
+
+
+def moving_share(looks: Sequence[Look]) -> Measure:
+    """Share of the images that moves."""
+    shares = [look.mask.mean() for look in looks if look.mask is not None]
+    share, value = (float(np.mean(shares)), f"{np.mean(shares):.1%} of the image area moves") if shares else UNKNOWN
+    advice = "leave more of what stands still in the picture, since the cameras are placed by that"
+    if share < LITTLE:
+        advice = "film longer, or closer, or train with --field static: hardly anything moves"
+    if not shares:
+        advice = "no masks of what moves, which lapgs-prepare makes of films"
+    return Measure("moving share", share, value, LITTLE, 0.5, "1% to 50%", advice)
+
+
+def coverage(looks: Sequence[Look]) -> Measure:
+    """Of cameras that stand still: how many see something move at one time."""
+    counts: dict[float, int] = {}  # of cameras that see something move, by time
+    for look in looks:
+        time = round(look.view.time, 6)
+        counts[time] = counts.get(time, 0) + (look.mask is not None and bool(look.mask.mean() > SEEN))
+    cameras = float(np.median([count for count in counts.values() if count] or [0]))
+    advice = "aim more cameras at what moves: where less than three see it, its place in depth is a guess"
+    value = f"{cameras:g} cameras see something move at one time"
+    return Measure("coverage", cameras, value, 3, math.inf, "3 or more", advice)
+
+
+def exposure(looks: Sequence[Look], points: Floats | None) -> Measure:
+    """How the same points (n, 3) of the cloud change in brightness: stops between the images, 5 to 95 % of them."""
+    stops, value = UNKNOWN
+    advice = "no cloud of points, by which the same places are found in other images"
+    if points is not None:
+        levels = np.stack([_stops(look, points) for look in looks])
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # of points that no image shows
+            relative = levels - np.nanmedian(levels, axis=0)
+            gains = [np.nanmedian(row) for row in relative if np.isfinite(row).sum() >= POINTS_SEEN]
+        advice = f"less than 3 images show {POINTS_SEEN} points of the cloud"
+        if len(gains) >= 3:
+            stops = float(np.ptp(np.percentile(gains, [5, 95])))
+            value = f"changes by {stops:.2f} stops between dark and bright images"
+            advice = "lock exposure and white balance; --exposure.enabled true corrects each image's colors"
+    return Measure("exposure", stops, value, 0, 0.3, "0.3 stops or less", advice)
+
+
+def _stops(look: Look, points: Floats) -> Floats:
+    """(n,) brightness at the points, NaN where they are out of view."""
+    camera, values = look.view.camera, np.full(len(points), np.nan)
+    _, seen = in_view(points, camera)
+    pixels, _ = camera.project(points[seen])
+    column, row = np.clip(np.floor(pixels).astype(np.int64), 0, [camera.width - 1, camera.height - 1]).T
+    values[seen] = np.log2(np.maximum((_gray(look.image)[row, column] / 255) ** 2.2, 1e-3))
+    return values
+
+
+def _gray(image: Pixels) -> NDArray[np.float32]:
+    """Gray levels (h, w), 0 to 255, of RGB."""
+    return image.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)

@@ -54,10 +54,12 @@ class Film:
 
     size: (width, height) of the upright frames, in pixels that are square. seconds: length as the header states it, 0
     if it does not. rate: frames a second, about. keeps_all: whether somebody chose the frames already.
+    start: seconds into the film, of which the nearest frame becomes the first one.
     notes: what the user should know of the file, one sentence each; `frames` adds to them while it decodes.
     """
 
     keeps_all = False
+    start = 0.0
 
     def __init__(self, path: Path) -> None:
         """Read the header. Raises InputError."""
@@ -73,7 +75,8 @@ class Film:
                     raise InputError(f"{path} is in a format that PyAV cannot decode; convert it to H.264.")
                 coded = (int(stream.width), int(stream.height))
                 self._aspect = pixel_aspect(stream)
-                self.seconds = _seconds(stream, file)
+                length = stream.duration and stream.time_base and stream.duration * stream.time_base
+                self.seconds = float(length or (file.duration or 0) / 1e6)  # of the container: microseconds
                 self.rate = float(stream.average_rate or stream.guessed_rate or 30.0)
         except (av.error.FFmpegError, OSError) as error:
             raise InputError(f"{path} is not a readable film ({error}); copy or record it again.") from None
@@ -87,7 +90,7 @@ class Film:
         """Decode the frames in the order of their times. Raises InputError; a film that is damaged after its first
         frames ends there, with a note."""
         av = import_av(self.path)
-        number, first, last, guessed, rate = 0, 0.0, -1.0, False, self.rate
+        number, first, last, guessed, rate, begin = 0, 0.0, -1.0, False, self.rate, None
         try:
             with av.open(str(self.path), metadata_errors="replace") as file:
                 stream = self._stream(file)
@@ -110,8 +113,9 @@ class Film:
                     if number and seconds <= last:  # no time stamp, or one that was there before
                         guessed, seconds = True, last + 1 / rate
                     seconds = max(seconds, 0.0)
-                    gray = _gray(frame, shown, shape)
-                    yield Frame(seconds, gray, partial(_pixels, frame, shown, shape))
+                    if seconds >= self.start - 0.5 / rate:
+                        begin = seconds if begin is None else begin
+                        yield Frame(seconds - begin, _gray(frame, shown, shape), partial(_pixels, frame, shown, shape))
                     number, last = number + 1, seconds
         except (av.error.FFmpegError, OSError) as error:
             if number < 2:
@@ -141,12 +145,6 @@ class Film:
         if not streams:
             raise InputError(f"{self.path} has no video stream; give the camera's recording.")
         return max(streams, key=lambda s: (s.width or 0) * (s.height or 0))
-
-
-def _seconds(stream: Any, file: Any) -> float:
-    if stream.duration is not None and stream.time_base is not None:
-        return float(stream.duration * stream.time_base)
-    return file.duration / 1e6 if file.duration is not None else 0.0  # of the container: microseconds
 
 
 def _squared(coded: Size, aspect: float) -> Size:

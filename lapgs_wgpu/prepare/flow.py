@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lapgs_wgpu.data.images import Pixels
 from lapgs_wgpu.prepare.film import Film
 from lapgs_wgpu.prepare.images import Picture
-from lapgs_wgpu.prepare.poses import import_cv2
+from lapgs_wgpu.prepare.poses import Plane, import_cv2
 from lapgs_wgpu.progress import Progress
 
 SIDE = 480  # longer side of the images that are followed, pixels
@@ -23,8 +23,6 @@ STEP = 4  # pixels between the places that are followed
 REACH = 6  # images, to either side
 BETWEEN = 4  # steps from one image to the next, at most
 MEET, MEET_SHARE = 1.5, 0.05  # pixels between a place and its way forth and back, and more by this share of the way
-
-Plane = NDArray[np.float32]
 
 
 class Motion:

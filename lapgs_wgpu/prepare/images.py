@@ -18,6 +18,7 @@ from lapgs_wgpu.data.thumbnails import EQUAL, blurred, repeats, sharpness
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.film import Film, Frame
 from lapgs_wgpu.prepare.poses import import_cv2
+from lapgs_wgpu.prepare.sound import start_together
 from lapgs_wgpu.progress import Progress, say
 
 FRAMES_PER_SECOND = 10.0  # of one moving camera: poses change slowly
@@ -104,13 +105,13 @@ def extract_in_step(films: Sequence[Film], images: Path, fps: float, shapes: Seq
 
     None is left out, and all films end with the shortest.
     """
+    start_together(films)
     cameras = []
     for number, (film, shape) in enumerate(zip(films, shapes, strict=True)):
         pictures = [_write(span, span.first, images, f"cam{number:02d}/", shape) for span in _spans(film, fps)]
         _tell(film, f"cam{number:02d}, {len(pictures)} images, one of each {1 / fps:.2g} s")
         cameras.append(pictures)
     ends = [pictures[-1].seconds for pictures in cameras]
-    say(f"the first frames of all {len(films)} films are taken to be of one moment.")
     if max(ends) > min(ends) + 1 / fps:
         say(f"the films are {min(ends):.2f} to {max(ends):.2f} s long; all are cut to {min(ends):.2f} s.")
     for pictures in cameras:

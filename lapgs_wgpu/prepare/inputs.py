@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import sys
 import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -24,6 +25,7 @@ from lapgs_wgpu.prepare.film import Film, Frame
 
 IMAGE_SUFFIXES = (*SUFFIXES, ".heic", ".heif", ".hif", ".avif", ".webp", ".tif", ".tiff", ".bmp")
 FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".m2ts", ".mpg", ".mpeg", ".wmv", ".3gp")
+HEIC = "pillow_heif"  # the module that reads it
 NUMBERED = 30.0  # images a second, where their names are numbers
 _IFD, _FOCAL = 0x8769, 0xA405  # EXIF: the camera's tags; the focal length of a film of 35 mm
 
@@ -76,7 +78,7 @@ def _opened_image(file: Path) -> Image.Image:
     """An image of any kind that a reader is installed for, upright; of EXIF's tags, info["exif"] keeps the focal length
     alone. Raises InputError."""
     with suppress(ImportError):
-        import_module("pillow_heif").register_heif_opener()
+        import_module(HEIC).register_heif_opener()
     try:
         with Image.open(file) as image:
             focal, exif = image.getexif().get_ifd(_IFD).get(_FOCAL), Image.Exif()
@@ -85,7 +87,7 @@ def _opened_image(file: Path) -> Image.Image:
             upright.info["exif"] = exif.tobytes()
             return upright
     except UnidentifiedImageError:
-        if file.suffix.lower() in (".heic", ".heif", ".hif"):
+        if file.suffix.lower() in (".heic", ".heif", ".hif") and HEIC not in sys.modules:
             raise InputError(f"{file} is HEIC, whose reader is not installed: pip install pillow-heif.") from None
         check_image(file)  # says what it is
         raise

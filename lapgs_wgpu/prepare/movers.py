@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.images import Size
-from lapgs_wgpu.prepare.flow import REACH, Motion, Plane
+from lapgs_wgpu.prepare.flow import REACH, Motion
 from lapgs_wgpu.prepare.masks import Mask
-from lapgs_wgpu.prepare.measures import Floats
-from lapgs_wgpu.prepare.poses import Match, import_cv2
+from lapgs_wgpu.prepare.poses import Floats, Match, Plane, import_cv2
 
 NOISE, NOISE_GROWS = 0.15, 0.05  # pixels of flow, at least: between neighbouring images; for each further one
 QUARTER, MEDIAN = 25, 1.55  # percentile of the errors that tells the noise; a median of noise beside it
@@ -32,8 +31,6 @@ HALO = 1.5  # times the error that parts what moves from the rest: flow bends ar
 SHARP = 2.5  # times the noise of the better of two reconstructions: it agrees
 LITTLE = 0.002  # share of an image: a smaller mask is noise
 AROUND, INSIDE = 10, 5  # pixels around what moves, where colors decide; within it, where they do not
-CUTS = 2  # of GrabCut
-MIDDLE = 0.7  # of width and height, that a reconstruction of the rims leaves out
 
 
 class Judged(NamedTuple):
@@ -198,7 +195,7 @@ def _cut(image: NDArray[np.uint8], vote: Plane, limit: float) -> Mask:
     label[moves > 0] = cv2.GC_PR_FGD
     label[cv2.erode((value > limit + np.log(2)).astype(np.uint8), disk(INSIDE)) > 0] = cv2.GC_FGD
     if (label == cv2.GC_BGD).any():
-        cv2.grabCut(image, label, None, np.zeros((1, 65)), np.zeros((1, 65)), CUTS, cv2.GC_INIT_WITH_MASK)
+        cv2.grabCut(image, label, None, np.zeros((1, 65)), np.zeros((1, 65)), 1, cv2.GC_INIT_WITH_MASK)
     inside = ((label == cv2.GC_FGD) | (label == cv2.GC_PR_FGD)).astype(np.uint8)
     return cv2.morphologyEx(inside, cv2.MORPH_OPEN, disk(1)) > 0
 
@@ -221,8 +218,5 @@ def in_mask(mask: Mask | None, places: NDArray[np.floating], size: Size) -> Mask
 
 
 def rim() -> Mask:
-    """Mask of the middle of an image, of any size. Its rim seldom shows what moves."""
-    mask = np.zeros((60, 60), bool)
-    edge = round(60 * (1 - MIDDLE) / 2)
-    mask[edge:-edge, edge:-edge] = True
-    return mask
+    """Mask of seven tenths of the width and height of an image of any size, whose rim seldom shows what moves."""
+    return np.pad(np.ones((42, 42), bool), 9)

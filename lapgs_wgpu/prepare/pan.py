@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.images import Size
-from lapgs_wgpu.prepare.measures import Floats
-from lapgs_wgpu.prepare.poses import Match
+from lapgs_wgpu.prepare.poses import Floats, Match
 
 MATCHES = 40  # of a pair of images
 SIGMA = 1.5e-3  # of the longer side: residual from which on a match counts little
@@ -22,16 +21,14 @@ CHAINED = 3  # images before one, from which its rotation may be chained
 ITERATIONS, TRIALS = 30, 60
 FIT = 2.5e-3  # of the longer side: a match up to this residual is explained
 FAR = 6  # images apart: near images of a camera that walks look turned, too
-RADIUS = 1.0  # of the sphere on which the points of a panorama lie
 
 
 @dataclass(frozen=True, eq=False)
 class Pan:
-    """names: of the images. rotations: (n, 3, 3), world to camera (x right, y down). focal: pixels. radial: first
+    """rotations: (n, 3, 3), world to camera (x right, y down). focal: pixels. radial: first
     coefficient. explained: share of the matches of images at least FAR apart (of all, in a shorter film). travel:
     pixels that the middle of the image moves between two images at most."""
 
-    names: tuple[str, ...]
     rotations: Floats
     focal: float
     radial: float
@@ -72,7 +69,7 @@ def solve_pan(
     axes = rotations[:, 2]
     turn = float(np.arccos(np.clip((axes @ axes.T).min(), -1, 1)))
     explained = float(fits[far].mean() if far.sum() > 100 else fits.mean())
-    return Pan(tuple(names), rotations, focal, radial, explained, focal * turn)
+    return Pan(rotations, focal, radial, explained, focal * turn)
 
 
 def rays(places: Floats, focal: float, radial: float) -> Floats:

@@ -6,8 +6,9 @@ import itertools
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,15 +28,8 @@ SEED = 0
 Pair = tuple[str, str]
 Ints = NDArray[np.integer]
 Floats = NDArray[np.float64]
+Plane = NDArray[np.float32]
 Match = Mapping[Pair, Ints]  # of pairs of images: (m, 2) numbers of their features
-
-
-class Features(NamedTuple):
-    """Of an image. places: (n, 4) float32, pixels (the middle of the first is 0.5, 0.5), size, radians. looks: (n, 128)
-    float32, square roots of SIFT's histograms, of length 1 (Arandjelovic and Zisserman 2012)."""
-
-    places: NDArray[np.float32]
-    looks: NDArray[np.float32]
 
 
 class Reconstruction:
@@ -50,7 +44,7 @@ class Reconstruction:
         self._colmap = colmap = import_pycolmap()
         self.images, self.names, self.model, self.lenses = images, list(names), model, lenses
         self.work = work
-        self.places: dict[str, NDArray[np.float32]] = {}
+        self.places: dict[str, Plane] = {}
         self._database = work / "database.db"
         work.mkdir(parents=True, exist_ok=True)
         with self.database():  # makes the file
@@ -64,23 +58,22 @@ class Reconstruction:
             camera = database.read_all_cameras()[0]
         self.prior, self.exif = float(camera.mean_focal_length()), bool(camera.has_prior_focal_length)
 
-    def find_features(self) -> dict[str, Features]:
-        """Find the features of all images."""
+    def find_features(self) -> dict[str, Plane]:
+        """Find the features of all images, whose places are kept; returns their descriptors (`sift`)."""
         found = {}
         with Progress(len(self.names), "images searched for features") as progress, self.database() as database:
             for name in self.names:
-                found[name] = sift(self.images / name)
-                self.places[name] = found[name].places
+                self.places[name], found[name] = sift(self.images / name)
                 database.write_keypoints(self.ids[name], self.places[name])
                 progress.step()
         return found
 
-    def match(self, pairs: Sequence[Pair], features: Mapping[str, Features]) -> dict[Pair, Ints]:
+    def match(self, pairs: Sequence[Pair], descriptors: Mapping[str, Plane]) -> dict[Pair, Ints]:
         """Match the features of pairs of images, and verify the matches."""
         matches = {}
         with Progress(len(pairs), "pairs of images matched") as progress:
             for one, other in pairs:
-                matches[one, other] = nearest(features[one].looks, features[other].looks)
+                matches[one, other] = nearest(descriptors[one], descriptors[other])
                 progress.step()
         self.use(matches)
         return matches
@@ -193,8 +186,9 @@ def reconstruction(
     return model
 
 
-def sift(path: Path) -> Features:
-    """The features of an image file."""
+def sift(path: Path) -> tuple[Plane, Plane]:
+    """The features of an image file: places (n, 4), pixels (the middle of the first is 0.5, 0.5), size, radians; and
+    descriptors (n, 128), square roots of SIFT's histograms, of length 1 (Arandjelovic and Zisserman 2012)."""
     cv2 = import_cv2()
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     scale = min(1.0, FEATURE_SIDE / max(image.shape))
@@ -202,20 +196,20 @@ def sift(path: Path) -> Features:
         image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     points, looks = cv2.SIFT_create(MOST_FEATURES, contrastThreshold=0.02).detectAndCompute(image, None)
     if not points:
-        return Features(np.zeros((0, 4), np.float32), np.zeros((0, 128), np.float32))
+        return np.zeros((0, 4), np.float32), np.zeros((0, 128), np.float32)
     found = [((p.pt[0] + 0.5) / scale, (p.pt[1] + 0.5) / scale, p.size / scale, np.radians(p.angle)) for p in points]
-    return Features(np.array(found, np.float32), np.sqrt(looks / np.maximum(looks.sum(axis=1, keepdims=True), 1e-9)))
+    return np.array(found, np.float32), np.sqrt(looks / np.maximum(looks.sum(axis=1, keepdims=True), 1e-9))
 
 
-def nearest(one: NDArray[np.float32], other: NDArray[np.float32]) -> Ints:
+def nearest(one: Plane, other: Plane) -> Ints:
     """(m, 2) numbers of descriptors (n, 128) that are each other's nearest, and clearly nearer than the second."""
     if min(len(one), len(other)) < 2:
         return np.zeros((0, 2), np.int64)
     alike, rows = one @ other.T, np.arange(len(one))
     match = alike.argmax(axis=1)
-    best, back = alike[rows, match], alike.argmax(axis=0)
+    best, back = alike[rows, match], alike.max(axis=0)
     alike[rows, match] = -1
-    kept = (back[match] == rows) & (np.maximum(1 - best, 1e-6) < RATIO**2 * (1 - alike.max(axis=1))) & (best > LIKE)
+    kept = (best == back[match]) & (np.maximum(1 - best, 1e-6) < RATIO**2 * (1 - alike.max(axis=1))) & (best > LIKE)
     return np.stack([rows[kept], match[kept]], axis=1)
 
 
@@ -229,26 +223,23 @@ def neighbouring_pairs(names: Sequence[str]) -> list[Pair]:
 
 def import_pycolmap() -> Any:
     """The module pycolmap, which logs nothing. Raises InputError where it is not installed."""
-    try:
-        import pycolmap
-    except ImportError:
-        raise InputError(
-            f"pycolmap, which finds out where the cameras stood, is not installed: {pip_install('prepare')}."
-        ) from None
-    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
-    return pycolmap
+    module = _imported("pycolmap", "pycolmap, which finds out where the cameras stood")
+    module.logging.minloglevel = int(module.logging.FATAL)
+    return module
 
 
 def import_cv2() -> Any:
     """The module cv2 of OpenCV. Raises InputError where it is not installed."""
+    module = _imported("cv2", "OpenCV, which finds and follows features")
+    module.setRNGSeed(0)
+    return module
+
+
+def _imported(name: str, what: str) -> Any:
     try:
-        import cv2
+        return import_module(name)
     except ImportError:
-        raise InputError(
-            f"OpenCV, which finds and follows features, is not installed: {pip_install('prepare')}."
-        ) from None
-    cv2.setRNGSeed(0)
-    return cv2
+        raise InputError(f"{what}, is not installed: {pip_install('prepare')}.") from None
 
 
 def merged(source: Reconstruction, matches: Match, groups: Sequence[Sequence[str]], work: Path) -> Reconstruction:

@@ -13,16 +13,16 @@ from PIL import Image
 from lapgs_wgpu.data.images import Size
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.prepare.masks import Mask
-from lapgs_wgpu.prepare.measures import path_faults
 from lapgs_wgpu.prepare.movers import without
-from lapgs_wgpu.prepare.pan import RADIUS, Pan, rays, solve_pan
+from lapgs_wgpu.prepare.pan import Pan, rays, solve_pan
+from lapgs_wgpu.prepare.path import path_faults
 from lapgs_wgpu.prepare.poses import Match, Reconstruction, import_pycolmap, reconstruction
 from lapgs_wgpu.progress import say
 
 FOCALS = 1.0, 1.4, 0.7  # times the width, where EXIF says nothing
 PURE, NEARLY = 0.8, 0.6  # share of the verified matches that turning alone explains: a pan; one, if nothing else fits
 GOOD, SHARP = 0.95, 1.5e-3  # the search ends: share of the images, and the mean error in parts of the longer side
-SECONDS, SECONDS_EACH, CORES = 60.0, 2.0, 2  # of the search: for any film, and for each image, on so many cores
+SECONDS, SECONDS_EACH, CORES = 30.0, 1.0, 2  # of the search: for any film, and for each image, on so many cores
 BENT = 0.4  # first radial coefficient of a lens, at most
 PANORAMA = 3000  # points of a pan
 
@@ -115,25 +115,25 @@ def described(source: Reconstruction, model: Any, *, together: bool = False, hel
 
 
 def panned(source: Reconstruction, pan: Pan, size: Size) -> Found:
-    """A pan as a reconstruction, with points of its features on a sphere."""
+    """A pan as a reconstruction, with points of its features on a sphere of radius 1."""
     rng = np.random.default_rng(0)
     points, colors = [], []
-    each = max(1, PANORAMA // len(pan.names))
-    for name, rotation in zip(pan.names, pan.rotations, strict=True):
+    each = max(1, PANORAMA // len(source.names))
+    for name, rotation in zip(source.names, pan.rotations, strict=True):
         at = source.places[name][:, :2].astype(np.float64)
         at = at[rng.permutation(len(at))[:each]]
         ray = rays(at - np.array(size) / 2, pan.focal, pan.radial)
-        points.append(RADIUS * ray / np.linalg.norm(ray, axis=1, keepdims=True) @ rotation)
+        points.append(ray / np.linalg.norm(ray, axis=1, keepdims=True) @ rotation)
         with Image.open(source.images / name) as image:
             pixels = np.asarray(image.convert("RGB"))
         column, row = np.clip(at.astype(int), 0, [size[0] - 1, size[1] - 1]).T
         colors.append(pixels[row, column])
     lens = Lens(*size, pan.focal, pan.focal, size[0] / 2, size[1] / 2, radial=(pan.radial, 0.0, 0.0))
-    poses = {name: np.hstack([R, np.zeros((3, 1))]) for name, R in zip(pan.names, pan.rotations, strict=True)}
-    model = reconstruction(dict.fromkeys(pan.names, lens), poses, source.cameras, source.ids)
+    poses = {name: np.hstack([R, np.zeros((3, 1))]) for name, R in zip(source.names, pan.rotations, strict=True)}
+    model = reconstruction(dict.fromkeys(source.names, lens), poses, source.cameras, source.ids)
     for point, color in zip(np.concatenate(points), np.concatenate(colors), strict=True):
         model.add_point3D(point, import_pycolmap().Track(), color)
-    return Found(model, pan.names, (), 0.0, pan.focal, pan)
+    return Found(model, tuple(source.names), (), 0.0, pan.focal, pan)
 
 
 def again(source: Reconstruction, found: Found, matches: Match, masks: Mapping[str, Mask], size: Size) -> Found | None:
