@@ -157,10 +157,7 @@ class ResidentPasses:
         corrections = self.corrections
         drawing = self.rasterizer.record(commands, drawn, sample.view.camera, sample.background, corrections.move)
         image = corrections.expose(commands, drawing.image)
-        terms, d_image = self._losses.record(
-            commands, image, truth, sample.background, self.weights(task), gradient=True
-        )
-        assert d_image is not None
+        terms, d_image = self._losses.record(commands, image, truth, sample.background, self.weights(task))
         d_image = corrections.expose_bwd(commands, drawing.image, d_image)
         by_drawn = self.rasterizer.record_bwd(commands, drawing, d_image, camera=corrections.moves_camera)
         corrections.sum_camera(commands, by_drawn.camera)
