@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from helpers.disturbed_walk import disturbed_walk, pose_errors, turn_between
 from helpers.image_losses import BACKGROUND, CAMERA, TRUTH, WEIGHTS, gaussians, gradients, step
-from helpers.interrupts import interrupt_at
 from helpers.loss_reference import total
 from helpers.scenes import relative
 from helpers.training import configure
@@ -22,7 +19,6 @@ from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.discovery.start_training import start_training
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.drawing import camera_gradient
 from lapgs_wgpu.splat.rasterize import upload_gaussians
@@ -208,24 +204,6 @@ def test_test_time_alignment_finds_the_camera(refined_walk: tuple[Trainer, list[
         assert turn < 0.5 * before
     again = aligned_view(training.scene, moved[0], torch.zeros(3), extent).camera
     assert np.array_equal(again.T_cam_world, near[0].camera.T_cam_world)
-
-
-def test_an_interrupted_run_goes_on_to_the_same_bytes(
-    device: Device, dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """With corrected colors, too."""
-    given = {"cameras__refine": "on", "cameras__start": "5", "exposure__enabled": "true"}
-    config = configure(schedule__save_interval="12", schedule__steps="24", **given)
-    train(config, dataset, tmp_path / "one", device=device)
-    with monkeypatch.context() as patched:
-        interrupt_at(20, patched)
-        with pytest.raises(KeyboardInterrupt):
-            train(config, dataset, tmp_path / "three", device=device)
-    resume(config, dataset, tmp_path / "three", device=device)
-    bytes_of = [(tmp_path / name / "checkpoint.ply").read_bytes() for name in ("one", "three")]
-    assert bytes_of[0] == bytes_of[1]
-    cameras = json.loads((tmp_path / "one/metrics.json").read_text())["training"]["cameras"]
-    assert 0 < cameras["rotation_degrees"]["median"] < 5
 
 
 @pytest.mark.parametrize(("refine", "own", "refined"), [("auto", True, True), ("auto", False, False),

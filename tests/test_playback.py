@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +13,7 @@ from helpers.playback import open_playback
 from helpers.ply_files import columns_of, ply_bytes, random_still
 from helpers.still_scenes import CAMERA, KINDS
 from helpers.trained_scenes import CONFIGS, OURS, trained
-from helpers.training import configure
 
-from lapgs_wgpu.data import load_dataset
-from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.gpu.array import DeviceArray, read_all
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.ply import GaussianSnapshot, write_ply
@@ -29,7 +25,6 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.splat.rasterizer import Rasterizer
-from lapgs_wgpu.train.trainer import Trainer
 
 TIMES = (0.0, 0.37, 1.0)
 ON_DEVICE = {"static", *CONFIGS}
@@ -115,21 +110,6 @@ def test_torch_evaluates_what_has_changed_alone(
     scene.sh_degree = 1
     playback.at(0.1)
     assert len(times) == 1
-
-
-@pytest.mark.parametrize(
-    "kind", ["laplacian", *(pytest.param(kind, marks=pytest.mark.nightly) for kind in ("static", "mlp", "hexplane"))]
-)
-def test_each_step_of_a_training_is_shown(device: Device, tmp_path: Path, kind: str) -> None:
-    dataset = load_dataset(write_synthetic(tmp_path / "scene", size=16, train_views=4, test_views=1))
-    training = Trainer(configure(method=kind), dataset, device)
-    playback = TorchPlayback(training.scene)
-    with closing(training):
-        for _ in range(12):
-            training.step()
-            shown, anew = (contents(each.at(0.4)) for each in (playback, TorchPlayback(training.scene)))
-            for found, expected in zip(shown, anew, strict=True):
-                np.testing.assert_array_equal(found, expected)
 
 
 @pytest.mark.kernels

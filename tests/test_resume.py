@@ -59,17 +59,24 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(
     assert {file.name for file in (tmp_path / "run").iterdir()} == {file.name for file in trained_run.iterdir()}
 
 
-@pytest.mark.nightly
-@pytest.mark.parametrize("method", ["static", "mlp", "hexplane", "grid4d"])
-def test_every_field_goes_on_to_the_same_bytes(
-    method: str, dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+KINDS = [
+    *(pytest.param({"method": each}, marks=pytest.mark.nightly, id=each) for each in ("static", "mlp", "hexplane")),
+    pytest.param({"method": "grid4d"}, marks=pytest.mark.nightly, id="grid4d"),
+    pytest.param({"cameras__refine": "on", "cameras__start": "5", "exposure__enabled": "true"}, id="corrections"),
+    pytest.param({"timing__refine": "true", "timing__start": "15", "timing__interval": "6"}, id="times"),
+]
+
+
+@pytest.mark.parametrize("given", KINDS)
+def test_every_kind_of_training_goes_on_to_the_same_bytes(
+    given: dict[str, str], dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    train(configure(method), dataset, tmp_path / "whole", device=device)
+    train(configure(**given), dataset, tmp_path / "whole", device=device)
     with monkeypatch.context() as patched:
-        interrupt_at(22, patched)
+        interrupt_at(23, patched)
         with pytest.raises(KeyboardInterrupt):
-            train(configure(method), dataset, tmp_path / "run", device=device)
-    resume(configure(method), dataset, tmp_path / "run", device=device)
+            train(configure(**given), dataset, tmp_path / "run", device=device)
+    resume(configure(**given), dataset, tmp_path / "run", device=device)
     assert (tmp_path / "run" / "checkpoint.ply").read_bytes() == (tmp_path / "whole" / "checkpoint.ply").read_bytes()
 
 

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from helpers.interrupts import interrupt_at
 from helpers.scenes import front_camera
 from helpers.training import configure
 from torch import Tensor, nn
@@ -21,9 +19,8 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation
-from lapgs_wgpu.motion.scene import Scene4D, load
+from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.motion.timing import EVEN, Timing
-from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.train.ground_truth import GroundTruth, HostImage
 from lapgs_wgpu.train.timing_refinement import FARTHEST, TimingRefinement, running_median
 from lapgs_wgpu.train.trainer import Trainer
@@ -136,20 +133,6 @@ def test_the_running_median_has_as_many_after_as_before() -> None:
 # In a training --------------------------------------------------------------------------------------------------------
 
 GIVEN = {"timing__refine": "true", "timing__start": "15", "timing__interval": "6"}
-
-
-def test_an_interrupted_training_goes_on_to_the_same_bytes(
-    dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = configure(**GIVEN, schedule__steps="28")
-    train(config, dataset, tmp_path / "whole", device=device)
-    assert load(tmp_path / "whole" / "checkpoint.ply", device).timing is not EVEN
-    with monkeypatch.context() as patched:
-        interrupt_at(23, patched)
-        with pytest.raises(KeyboardInterrupt):
-            train(config, dataset, tmp_path / "run", device=device)
-    resume(config, dataset, tmp_path / "run", device=device)
-    assert (tmp_path / "run" / "checkpoint.ply").read_bytes() == (tmp_path / "whole" / "checkpoint.ply").read_bytes()
 
 
 @pytest.mark.parametrize("moments", [[0.1, 0.2], list(np.linspace(1, 0, 8))])

@@ -47,7 +47,7 @@ class RenderLoss(NamedTuple):
 
 
 class _Comparison(NamedTuple):
-    """What `_FusedLoss` takes besides tensors; see `render_loss`. wanted: whether any tensor wants a gradient."""
+    """What `_FusedLoss` takes besides tensors; see `render_loss`."""
 
     camera: Camera
     camera_unit: float
@@ -57,7 +57,6 @@ class _Comparison(NamedTuple):
     weights: LossWeights
     device: Device
     own: Sequence[tuple[TorchLoss, float]]
-    wanted: bool
 
 
 # The passes of a device, whose buffers serve all calls of `render_loss`.
@@ -78,8 +77,7 @@ def render_loss(
 ) -> RenderLoss:
     """The weighted sum of the image losses of the rendered Gaussians, computed on the device from end to end.
 
-    The same bits on every run of one adapter and driver. Under torch.no_grad(), or where no tensor wants a gradient,
-    none is computed.
+    The same bits on every run of one adapter and driver. The gradients are always computed.
 
     Args:
         gaussians: activated, float32, with harmonics.
@@ -94,22 +92,13 @@ def render_loss(
             `camera_unit` (splat.drawing.CameraGradient); None for none.
         camera_unit: world units.
     """
-    tensors = (
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.sh,
-        correction,
-        camera_change,
-    )
-    wanted = torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in tensors)
-    probe = gaussians.means.new_empty((len(gaussians), 2)).requires_grad_(wanted)
+    of_gaussians = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh
+    probe = gaussians.means.new_empty((len(gaussians), 2)).requires_grad_()
     red, green, blue = background.tolist()
     comparison = _Comparison(
-        camera, camera_unit, gaussians.antialiased, truth, (red, green, blue), weights, device, own, wanted
+        camera, camera_unit, gaussians.antialiased, truth, (red, green, blue), weights, device, own
     )
-    loss, computed, radii, centres = _FusedLoss.apply(comparison, *tensors, probe)
+    loss, computed, radii, centres = _FusedLoss.apply(comparison, *of_gaussians, correction, camera_change, probe)
     probe.data = centres
     names = ("l1", "mse", "ssim", "pyramid", "ncc", *(term.name for term, _ in own))
     used = (True, True, weights.ssim, weights.pyramid, weights.ncc, *[True] * len(own))
@@ -137,41 +126,38 @@ class _FusedLoss(torch.autograd.Function):
         change: Tensor | None,
         probe: Tensor,
     ) -> tuple[Tensor, ...]:
-        camera, unit, antialiased, truth, background, weights, device, own, wanted = comparison
+        camera, unit, antialiased, truth, background, weights, device, own = comparison
         rasterizer, losses, exposing = rasterizer_of(device), image_loss_of(device), exposure_of(device)
         leaves = Gaussians(means, quats, scales, opacities, sh=sh, antialiased=antialiased)
         gaussians = upload_gaussians(rasterizer.pool, leaves)
         corrections = None if correction is None else upload(exposing.pool, "correction", correction)
         while True:
-            drawing = rasterizer.draw(gaussians, camera, background, gradient=wanted)
-            d_rows, d_gaussians = [], []
+            drawing = rasterizer.draw(gaussians, camera, background, gradient=True)
+            d_rows = []
             with Commands(device) as commands:
                 image = drawing.image if corrections is None else exposing.record(commands, drawing.image, corrections)
-                terms, d_image = losses.record(commands, image, truth, background, weights, gradient=wanted)
+                terms, d_image = losses.record(commands, image, truth, background, weights)
             own_values = _own_terms(own, image, truth, background, d_image)
-            if d_image is not None and corrections is not None:
+            if corrections is not None:
                 with Commands(device) as commands:
                     d_image, d_correction = exposing.record_bwd(commands, drawing.image, d_image, corrections)
                     d_rows = [d_correction]
-            if d_image is not None:
-                back = rasterizer.backward(drawing, d_image, camera=change is not None)
-                d_gaussians = back.arrays()
-                d_rows += [] if back.camera is None else [back.camera]
+            back = rasterizer.backward(drawing, d_image, camera=change is not None)
+            d_gaussians = back.arrays()
+            d_rows += [] if back.camera is None else [back.camera]
             found = iter(read_all([terms, drawing.splats, *d_gaussians, *d_rows, *drawing.needed]))
             values, splats, gradients = next(found), next(found), [next(found) for _ in d_gaussians]
             rows = [next(found) for _ in d_rows]
             # Where the intersections did not fit, none of this is right, and all of it is done again.
             if not rasterizer.grow_on_overflow(drawing, list(found)):
                 break
-        ctx.gradients = None
-        if gradients:
-            by_gaussians, d_means2d = gradient_tensors(gradients, opacities)
-            by_correction = None if correction is None else correction.new_tensor(rows[0].sum(axis=0, dtype=np.float64))
-            by_camera = None
-            if change is not None:
-                by = camera_gradient(rows[-1])
-                by_camera = change.new_tensor([*by.rotation, *(unit * by.position)])
-            ctx.gradients = (*by_gaussians, by_correction, by_camera, d_means2d)
+        by_gaussians, d_means2d = gradient_tensors(gradients, opacities)
+        by_correction = None if correction is None else correction.new_tensor(rows[0].sum(axis=0, dtype=np.float64))
+        by_camera = None
+        if change is not None:
+            by = camera_gradient(rows[-1])
+            by_camera = change.new_tensor([*by.rotation, *(unit * by.position)])
+        ctx.gradients = (*by_gaussians, by_correction, by_camera, d_means2d)
         computed = torch.from_numpy(np.append(values.astype(np.float64), own_values))
         radii, centres = radii_and_centres(splats, probe.device)
         ctx.mark_non_differentiable(computed, radii, centres)
@@ -189,13 +175,12 @@ def _own_terms(
     image: DeviceArray,
     truth: DeviceArray,
     background: tuple[float, float, float],
-    d_image: DeviceArray | None,
+    d_image: DeviceArray,
 ) -> list[float]:
     """The values of the further terms of an image, whose weighted gradients are added to d_image (4, H, W)."""
     values = []
     for term, weight in own:
         value, gradient = torch_loss(term, image, truth, background, weight)
         values.append(value)
-        if d_image is not None:
-            d_image.write(d_image.read() + gradient)
+        d_image.write(d_image.read() + gradient)
     return values

@@ -42,11 +42,11 @@ def pyramid_weights(levels: int) -> list[float]:
 
 class LossArrays(NamedTuple):
     """terms (5,) float32: L1, mean squared error, 1 - SSIM, pyramid, NCC; the last three 0 where their weight is 0.
-    d_image (4, H, W) float32: the weighted loss's gradient by red, green, blue, and zeros; None where none was asked.
+    d_image (4, H, W) float32: the weighted loss's gradient by red, green, blue, and zeros.
     """
 
     terms: DeviceArray
-    d_image: DeviceArray | None
+    d_image: DeviceArray
 
 
 class ImageLoss:
@@ -69,14 +69,12 @@ class ImageLoss:
         truth: DeviceArray,
         background: tuple[float, float, float],
         weights: LossWeights,
-        *,
-        gradient: bool,
     ) -> LossArrays:
         """Compare an image with its ground truth.
 
         image: planes (4, H, W) of float32, the first three red, green, blue. truth: (H, W) uint32, straight RGBA of 8
         bits, red lowest. background: in [0, 1], under the ground truth, which is rounded to 8 bits, as
-        data/views.composite does. weights: of the terms. gradient: whether to leave it, too.
+        data/views.composite does. weights: of the terms.
         """
         height, width = truth.shape
         frame = _Frame(self, commands, height, width, background, weights)
@@ -87,8 +85,6 @@ class ImageLoss:
         correlated = frame.ncc_forward(pixels) if frame.ncc_windows else None
         levels = frame.pyramid_forward(pixels)
         terms = frame.sum_up()
-        if not gradient:
-            return LossArrays(terms, None)
         if correlated:
             extra["ncc"] = frame.ncc_backward(pixels, *correlated)
         if levels:

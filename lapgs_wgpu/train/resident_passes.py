@@ -141,8 +141,7 @@ class ResidentPasses:
         corrections, weights = self.corrections, self.weights(task)
         drawing = self.rasterizer.record(commands, drawn, task.view.camera, task.background, corrections.move)
         image = corrections.expose(commands, drawing.image)
-        terms, d_image = self._losses.record(commands, image, truth, task.background, weights, gradient=True)
-        assert d_image is not None
+        terms, d_image = self._losses.record(commands, image, truth, task.background, weights)
         d_image = corrections.expose_bwd(commands, drawing.image, d_image)
         by_drawn = self.rasterizer.record_bwd(commands, drawing, d_image, camera=corrections.moves_camera)
         corrections.sum_camera(commands, by_drawn.camera)
