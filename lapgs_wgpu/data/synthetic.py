@@ -28,7 +28,6 @@ from lapgs_wgpu.data.raytrace import (
     solid_hits,
     to_pixels,
 )
-from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
 CAMERA_ANGLE_X = 0.6911112070083618  # horizontal field of view in radians, that of D-NeRF's scenes
@@ -143,11 +142,6 @@ def write_synthetic(
     The same arguments give the same bytes. A folder that already holds this very scene is left as it is, and one that
     holds anything else is refused with InputError. The folder appears only when it is whole.
     """
-    if size < 1 or train_views < 2 or test_views < 1:
-        raise InputError(
-            "the built-in scene needs a size of at least 1, 2 training views and 1 test view, "
-            f"got {size}, {train_views} and {test_views}."
-        )
     parameters = {"version": VERSION, "size": size, "train_views": train_views, "test_views": test_views}
     train, test = split_times(train_views, test_views)
     splits = {
