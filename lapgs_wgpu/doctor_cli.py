@@ -24,7 +24,7 @@ a known image on one adapter and computes its gradient.
 The report is Markdown. It contains no names of users, hosts or folders. Exit code: 0 if all checks passed, 1 if one
 failed, 3 without an adapter."""
 
-PACKAGES = ("lapgs-wgpu", "torch", "wgpu", "numpy", "scipy", "pillow", "imgui-bundle", "av", "pycolmap")
+PACKAGES = ("lapgs-wgpu", "torch", "wgpu", "numpy", "scipy", "imageio", "pillow", "imgui-bundle", "av", "pycolmap")
 # Environment variables that choose drivers or threads.
 VARIABLES = (
     "LAPGS_DEVICE", "VK_DRIVER_FILES", "VK_ICD_FILENAMES", "WGPU_BACKEND_TYPE", "LP_NUM_THREADS",

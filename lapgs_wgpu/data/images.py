@@ -1,8 +1,11 @@
-"""Image files, PNG and JPEG: header checks, decoding, resampling, encoding."""
+"""Image files, PNG and JPEG: header checks, decoding, resampling, encoding.
+
+imageio decodes and encodes. Pillow, on which imageio's plugin is built, does what imageio does not offer: read a header
+without decoding the image, verify checksums, restrict the formats, decode a JPEG at a fraction of its size, resample.
+"""
 
 from __future__ import annotations
 
-import io
 import math
 import struct
 import zlib
@@ -11,6 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import imageio.v3 as iio
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
@@ -132,11 +136,14 @@ def decode(path: Path) -> Pixels:
 
     Of 16 bits per channel, the upper 8 are kept.
     """
-    with _decoding(path), Image.open(path, formats=_FORMATS) as file:
-        if file.mode.startswith("I"):  # Pillow clips 16 bits of gray, and takes the upper 8 of RGB
-            gray = (np.asarray(file) >> 8).astype(np.uint8)
+    with _decoding(path), open(path, "rb") as file:  # not the path: imageio would look into archives
+        header = Image.open(file, formats=_FORMATS)
+        transparent = _has_alpha(header)
+        if header.mode.startswith("I"):  # Pillow clips 16 bits of gray, and takes the upper 8 of RGB
+            gray = (np.asarray(header) >> 8).astype(np.uint8)
             return np.repeat(gray[..., None], 3, axis=2)
-        return np.array(file.convert("RGBA" if _has_alpha(file) else "RGB"))
+        file.seek(0)
+        return iio.imread(file, plugin="pillow", index=0, mode="RGBA" if transparent else "RGB")
 
 
 def decode_gray(path: Path) -> NDArray[Any]:
@@ -166,18 +173,17 @@ def _decoding(path: Path) -> Iterator[None]:
 
 def encode_png(image: Pixels, *, level: int = 6) -> bytes:
     """Encode an image (H, W) gray, (H, W, 3) RGB or (H, W, 4) RGBA as PNG. level: of the compression, 0 to 9."""
-    return _encoded(image, "PNG", compress_level=level)
+    return _encoded(image, ".png", compress_level=level)
 
 
 def encode_jpeg(image: Pixels, *, quality: int) -> bytes:
     """Encode an image (H, W, 3) RGB as JPEG. quality: 1 to 95."""
-    return _encoded(image, "JPEG", quality=quality)
+    return _encoded(image, ".jpg", quality=quality)
 
 
-def _encoded(image: Pixels, form: str, **options: int) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, form, **options)
-    return buffer.getvalue()
+def _encoded(image: Pixels, extension: str, **options: Any) -> bytes:
+    options["is_batch"] = False
+    return iio.imwrite("<bytes>", image, extension=extension, plugin="pillow", **options) or b""
 
 
 def resize(image: Pixels, size: Size, resampling: Image.Resampling) -> Pixels:
