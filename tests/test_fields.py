@@ -130,11 +130,24 @@ def test_time_fills_a_share_of_its_axis() -> None:
 def test_many_gaussians_pass_hidden_layers_in_blocks(
     device: Device, kind: FieldKind, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """The same values and gradients, and of the decoder's activations none is kept for the backward pass."""
     field = grid_field(device, replace(OURS, kind=kind, depth=1, width=64))
-    whole = parts(field(POINTS, 0.3, DYNAMICS))
-    monkeypatch.setattr(grid_field_module, "_BLOCK", 16)
-    for found, expected in zip(parts(field(POINTS, 0.3, DYNAMICS)), whole, strict=True):
-        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+    d = DYNAMICS.clone().requires_grad_() if kind == "laplacian" else None
+    learnt = [*field.parameters(), *([] if d is None else [d])]
+    found, kept = [], []
+    for most in (COUNT, COUNT - 1):
+        monkeypatch.setattr(grid_field_module, "KEPT", most)
+        monkeypatch.setattr(grid_field_module, "_BLOCK", 16)
+        shapes: list[tuple[int, ...]] = []
+        with torch.autograd.graph.saved_tensors_hooks(lambda x, to=shapes: to.append(tuple(x.shape)) or x, lambda x: x):
+            move = field(POINTS, 0.3, d, NEARBY)
+        kept.append(sum(shape[0] in (16, 8, COUNT) and shape[1:] == (64,) for shape in shapes))
+        gradients = torch.autograd.grad(sum(part.square().sum() for part in parts(move)), learnt)
+        found.append([*(part.detach() for part in parts(move)), *gradients])
+    assert kept[0] > 0
+    assert kept[1] == 0
+    for whole, blocks in zip(*found, strict=True):
+        torch.testing.assert_close(blocks, whole, rtol=1e-4, atol=1e-5)
 
 
 def test_ablations_of_the_field(device: Device) -> None:

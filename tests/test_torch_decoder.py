@@ -102,6 +102,23 @@ def test_the_number_of_threads_changes_no_bit(most: int, monkeypatch: pytest.Mon
     assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
 
 
+def test_many_gaussians_keep_no_activations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are computed again: the same bits, also where a gradient is asked for twice."""
+    inputs, weights = problem(1200)
+    found, kept = [], []
+    for most in (1200, 1199):
+        monkeypatch.setattr(torch_decoder, "KEPT", most)
+        shapes: list[tuple[int, ...]] = []
+        static = inputs[0].clone().requires_grad_()
+        with torch.autograd.graph.saved_tensors_hooks(lambda x, to=shapes: to.append(tuple(x.shape)) or x, lambda x: x):
+            outputs = decode(static, *inputs[1:], weights)
+        kept.append((600, WIDTH) in shapes)
+        for retain in (True, False):
+            found.append(torch.autograd.grad(outputs.square().sum(), static, retain_graph=retain)[0])
+    assert kept == [True, False]
+    assert all(torch.equal(each, found[0]) for each in found)
+
+
 def test_gradients_are_recorded_by_the_caller_alone() -> None:
     inputs, weights = problem(1200)
     with torch.no_grad():

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import GEOMETRY, TEMPORAL_AXES, FieldConfig
@@ -12,7 +15,7 @@ from lapgs_wgpu.motion.fields.hash_encoder import HashEncoder, HashGrid
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion, TimeMotion
 from lapgs_wgpu.motion.fields.layers import linear, zero_head
 from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
-from lapgs_wgpu.motion.fields.torch_decoder import DecoderWeights, decode
+from lapgs_wgpu.motion.fields.torch_decoder import KEPT, DecoderWeights, decode
 
 _BLOCK = 1 << 13  # Gaussians per block decoded by hidden layers
 
@@ -128,9 +131,14 @@ class GridField(nn.Module):
         inputs = static, temporal, dynamics if self.config.dynamics_size else None
         if not len(self.hidden):
             return decode(*inputs, self._weights(t))
-        count = -(-len(static) // _BLOCK) or 1  # blocks, which avoid large allocations
+        # In blocks, which avoids large allocations. For many Gaussians the backward pass computes them again: the
+        # activations, 4 KB per Gaussian at a width of 256, would be most of a training's memory.
+        decode_block = self._decode_hidden
+        if len(static) > KEPT:
+            decode_block = partial(checkpoint, decode_block, use_reentrant=False, preserve_rng_state=False)
+        count = -(-len(static) // _BLOCK) or 1
         blocks = zip(*([None] * count if part is None else part.split(_BLOCK) for part in inputs), strict=True)
-        return torch.cat([self._decode_hidden(t, *block) for block in blocks])
+        return torch.cat([decode_block(t, *block) for block in blocks])
 
     def _decode_hidden(self, t: float, static: Tensor, temporal: Tensor | None, dynamics: Tensor | None) -> Tensor:
         """Return the same after the hidden layers: `decode` gives what these read, and the gated channels, which the

@@ -19,6 +19,7 @@ from torch import Tensor
 
 FEWEST = 1 << 9  # Gaussians from which on there is more than one block
 LARGEST = 1 << 13  # Gaussians of a block
+KEPT = 1 << 16  # Gaussians up to which activations are kept for the backward pass instead of computed again
 
 Result = TypeVar("Result")
 
@@ -93,14 +94,14 @@ class _Decode(torch.autograd.Function):
     def forward(ctx: Any, static: Tensor, temporal: Tensor | None, dynamics: Tensor | None, *given: Any) -> Tensor:
         weights, inputs = DecoderWeights(*given), _Inputs(static, temporal, dynamics)
         outputs = weights.heads.new_empty(len(static), len(weights.heads))
-        keep = any(ctx.needs_input_grad)
+        keep = any(ctx.needs_input_grad) and len(static) <= KEPT
 
         def decode_block(block: slice) -> tuple[Tensor | None, ...]:
             activations, target = _activations(inputs.rows(block), weights), outputs[block]
             torch.addmm(weights.heads_bias, activations.gated, weights.heads.T, out=target)
             if activations.inner is not None and weights.motion_heads is not None:
                 target.addmm_(activations.inner, weights.motion_heads.T)
-            return activations if keep else ()
+            return activations if keep else (None,) * len(activations)
 
         kept = _each_block(decode_block, len(static))
         ctx.save_for_backward(static, temporal, dynamics, *given, *(each for block in kept for each in block))
@@ -115,7 +116,9 @@ class _Decode(torch.autograd.Function):
         kept = zip(*[iter(saved[sum(sizes) :])] * len(_Activations._fields), strict=True)
 
         def differentiate_block(block: slice, own: tuple[Any, ...]) -> DecoderWeights:
-            return _backward(inputs.rows(block), _Activations(*own), d_results[0][block], weights, d_inputs.rows(block))
+            here = inputs.rows(block)
+            activations = _activations(here, weights) if own[0] is None else _Activations(*own)
+            return _backward(here, activations, d_results[0][block], weights, d_inputs.rows(block))
 
         parts = zip(*_each_block(differentiate_block, len(inputs.static), kept), strict=True)
         return (*d_inputs, *(None if part[0] is None else sum(part[1:], part[0]) for part in parts))
