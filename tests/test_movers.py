@@ -13,9 +13,11 @@ from PIL import Image
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.mover_cube import mover_cube
+from lapgs_wgpu.data.views import composite, small_views
 from lapgs_wgpu.discovery.cutouts import cutout_tracks
 from lapgs_wgpu.discovery.residual import Residual
 from lapgs_wgpu.discovery.start_training import start_training
+from lapgs_wgpu.discovery.static_fit import static_fit
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.train.presets import load_config
@@ -82,3 +84,8 @@ def test_a_film_starts_from_its_masks(tmp_path: Path, device: Device) -> None:
         assert "moving parts" in training.discovery
         assert all(view.moving is not None for view in (*training.dataset.train, *training.dataset.test))
         assert training.step().step == 1
+        images = static_fit(training.config, training.dataset, device, lambda step: None).images
+        views = small_views(training.dataset.train, 64)
+        for image, view in zip(images, sorted(views, key=lambda view: view.time), strict=True):
+            assert image.mask.any()
+            assert image.image == pytest.approx(composite(view.load(), np.zeros(3)) / 255, abs=1e-6)

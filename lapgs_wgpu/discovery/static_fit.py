@@ -43,8 +43,9 @@ def static_fit(config: Config, dataset: Dataset, device: Device, progress: Calla
     of whose losses L1 and SSIM are left. progress: called with each step.
     """
     picked = spread_views(dataset.train, MOST_VIEWS)
-    small = [_without_movers(view) for view in small_views(picked, config.discovery.size)]
-    with Trainer(static_config(config), dataclasses.replace(dataset, train=tuple(small)), device) as training:
+    small = small_views(picked, config.discovery.size)
+    fitted = tuple(_without_movers(view) for view in small)
+    with Trainer(static_config(config), dataclasses.replace(dataset, train=fitted), device) as training:
         for result in training:
             progress(result.step)
     background, refinement = torch.full((3,), BACKGROUND_LEVELS[config.data.background]), training.cameras
