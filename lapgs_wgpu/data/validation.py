@@ -94,12 +94,11 @@ def _black_cameras(frames: Sequence[Frame]) -> list[str]:
             by_camera.setdefault(frame.name.camera, []).append(frame.image)
     several = {name: evenly(images, BLACK_AT) for name, images in by_camera.items() if len(images) > 1}
     black = [name for name, images in several.items() if all(decode(i.path)[..., :3].max() < BLACK for i in images)]
-    if len(several) < 2 or not black:
+    if not black:
         return []
     return [
         f"camera {black[0]} is black (one of {len(black)} of {len(several)}): in {len(several[black[0]])} of its "
-        f"{len(by_camera[black[0]])} images, such as {several[black[0]][0]}, no level reaches {BLACK} of 255; leave it "
-        "out, or the scene has black Gaussians before it."
+        f"{len(by_camera[black[0]])} images, such as {several[black[0]][0]}, no level reaches {BLACK} of 255: leave it out."
     ]
 
 
