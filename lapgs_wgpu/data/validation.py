@@ -98,7 +98,7 @@ def _black_cameras(frames: Sequence[Frame]) -> list[str]:
         return []
     return [
         f"camera {black[0]} is black (one of {len(black)} of {len(several)}): in {len(several[black[0]])} of its "
-        f"{len(by_camera[black[0]])} images, such as {several[black[0]][0]}, no level reaches {BLACK} of 255: leave it out."
+        f"{len(by_camera[black[0]])} images, such as {several[black[0]][0]}, no level reaches {BLACK}: leave it out."
     ]
 
 

@@ -7,20 +7,22 @@ from collections.abc import Callable
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor, nn
 
 from lapgs_wgpu.discovery.tracks import Tracks
 from lapgs_wgpu.motion.fields.config import APPEARANCE_SCALE
+from lapgs_wgpu.motion.fields.deformation import Deformation, TimeSamples
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.optimizer import ADAM_EPS
 
-AT_ONCE = 8  # times that a step looks at, of tracks that fade
+AT_ONCE, FEWER = 8, 2  # for tracks that fade: times that a step looks at, and how many times fewer of them it asks
 STILL = 300  # Gaussians of the static fit that a step asks to stay where they are
 MOVING = 1500  # Gaussians of tracks that a step asks, at most
 HASH_RATE, MLP_RATE = 1e-2, 2e-3  # learning rates: half of those of the preset tiny, twice train.start.MAX_*_RATE
 LAST = 0.05  # of the learning rates, in the end; they fall over the second half
 SHAPE_WEIGHT = 0.1  # of changes of scales and quaternions, which the tracks do not know
-SHEET_SCALE_WEIGHT = 10.0  # times as large, of the scales of sheets
+SHEET_STIFF = 10.0  # times as much, of the scales of tracks that fade
 FADED, FADE_WEIGHT = 7.0, 0.1  # logits by which what is not seen loses opacity; weight of the distance from that
 HINGES = 3.0  # of the decoder's units, whose inputs are of the size 1: how much they change over the clip
 OPEN = 2.0  # the gate's inputs: 0.76 is let through
@@ -61,40 +63,39 @@ def fit_field(
     moving = torch.arange(still, still + len(tracks.part), device=device)
     order: list[int] = []
     errors: list[float] = []
-    at_once = AT_ONCE if fades else 1
+    at_once, most = (AT_ONCE, MOVING // FEWER) if fades else (1, MOVING)
     for step in range(steps):
-        loss, distances = torch.zeros((), device=device), []
+        now: list[int] = []
         for _ in range(at_once):
             order = order or torch.randperm(len(times), generator=generator).tolist()
-            at = order.pop()
-            most = min(still, STILL // at_once)
-            staying = torch.randint(max(still, 1), (most,), generator=generator).to(device)
-            asked = moving
-            if len(moving) > MOVING // at_once:
-                asked = moving[torch.randint(len(moving), (MOVING // at_once,), generator=generator).to(device)]
-            if fades and (shown := supported[at].nonzero()[:, 0]).numel():
-                few = torch.randint(len(shown), (len(asked) // 2,), generator=generator).to(device)
-                asked = torch.cat([still + shown[few], asked[len(few) :]])
-            on_track = asked - still
-            rows = torch.cat([asked, staying])
-            means = scene.parameters["means"].detach()[rows]
-            dynamics = scene.parameters["dynamics"].detach()[rows] if "dynamics" in scene.parameters else None
-            move = field(means, float(times[at]), dynamics, None)
+            now.append(order.pop())
+        staying = torch.randint(max(still, 1), (min(still, STILL),), generator=generator).to(device)
+        asked = moving
+        if len(moving) > most:
+            asked = moving[torch.randint(len(moving), (most,), generator=generator).to(device)]
+        on_track = asked - still
+        rows = torch.cat([asked, staying])
+        means = scene.parameters["means"].detach()[rows]
+        dynamics = scene.parameters["dynamics"].detach()[rows] if "dynamics" in scene.parameters else None
+        loss, distance = torch.zeros((), device=device), 0.0
+        for at, move in zip(now, _moves(field, means, [float(times[at]) for at in now], dynamics), strict=True):
             moved = move.apply_to_means(means)
             seen = supported[at, on_track]
-            counted = torch.cat([seen.float(), torch.ones(len(staying), device=device)])
+            weights = torch.cat([seen.float(), torch.ones(len(staying), device=device)])
             squared = (moved - torch.cat([paths[at, on_track], means[len(asked) :]])).square().sum(dim=1)
-            loss = loss + (counted * (squared + SOFTENING**2).sqrt()).mean()
-            weights = SHAPE_WEIGHT * (SHEET_SCALE_WEIGHT if fades else 1.0), SHAPE_WEIGHT
-            loss = loss + sum(
-                weight * change.abs().mean()
-                for weight, change in zip(weights, (move.d_scales, move.d_quats), strict=True)
+            loss = loss + (weights * (squared + SOFTENING**2).sqrt()).mean()
+            stiff = 1.0 if move.d_scales is None or not fades else SHEET_STIFF
+            loss = loss + SHAPE_WEIGHT * sum(
+                (weight * change).abs().mean()
+                for weight, change in ((stiff, move.d_scales), (1.0, move.d_quats))
                 if change is not None
             )
             if fades and move.d_opacity is not None:
-                fading = move.d_opacity + FADED * torch.cat([~seen, seen.new_zeros(len(staying))])
-                loss = loss + FADE_WEIGHT * fading.abs().mean()
-            distances.append((seen * squared[: len(asked)].detach().sqrt()).sum() / seen.sum().clamp(min=1))
+                fading = (move.d_opacity + FADED * torch.cat([~seen, seen.new_zeros(len(staying))])).abs()
+                of_tracks, of_still = fading.split([len(asked), len(staying)])
+                kinds = of_tracks[seen], of_tracks[~seen], of_still
+                loss = loss + FADE_WEIGHT * sum(each.mean() for each in kinds if len(each))
+            distance += float((seen * squared[: len(asked)].detach().sqrt()).sum() / seen.sum().clamp(min=1))
         if not loss.requires_grad:
             return None
         for group, (rate, _) in zip(optimizer.param_groups, groups, strict=True):
@@ -102,10 +103,18 @@ def fit_field(
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        errors.append(float(torch.stack(distances).mean()))
+        errors.append(distance / at_once)
         progress(step + 1)
     optimizer.zero_grad()
     return float(np.mean(errors[-max(1, steps // 10) :]))
+
+
+def _moves(field: nn.Module, means: Tensor, times: list[float], dynamics: Tensor | None) -> list[Deformation]:
+    """The deformation at each time."""
+    if len(times) > 1 and isinstance(field, GridField):
+        others = TimeSamples(torch.arange(len(means), device=means.device), tuple(times[1:]))
+        return field.at_times(means, times[0], dynamics, None, others)
+    return [field(means, t, dynamics, None) for t in times]
 
 
 def _tell_times(field: GridField, generator: torch.Generator) -> None:
