@@ -23,7 +23,7 @@ HASH_RATE, MLP_RATE = 1e-2, 2e-3  # learning rates: half of those of the preset 
 LAST = 0.05  # of the learning rates, in the end; they fall over the second half
 SHAPE_WEIGHT = 0.1  # of changes of scales and quaternions, which the tracks do not know
 SHEET_STIFF = 10.0  # times as much, of the scales of tracks that fade
-FADED, FADE_WEIGHT = 7.0, 0.1  # logits by which what is not seen loses opacity; weight of the distance from that
+FADED, FADE_WEIGHT = 7.0, 0.03  # logits by which what is not seen loses opacity; weight of the distance from that
 HINGES = 3.0  # of the decoder's units, whose inputs are of the size 1: how much they change over the clip
 OPEN = 2.0  # the gate's inputs: 0.76 is let through
 SOFTENING = 1e-2  # world units; distances below count as squares
@@ -81,9 +81,13 @@ def fit_field(
         for at, move in zip(now, _moves(field, means, [float(times[at]) for at in now], dynamics), strict=True):
             moved = move.apply_to_means(means)
             seen = supported[at, on_track]
-            weights = torch.cat([seen.float(), torch.ones(len(staying), device=device)])
             squared = (moved - torch.cat([paths[at, on_track], means[len(asked) :]])).square().sum(dim=1)
-            loss = loss + (weights * (squared + SOFTENING**2).sqrt()).mean()
+            far = (squared + SOFTENING**2).sqrt()
+            if fades:  # few are seen at a time
+                loss = loss + (seen * far[: len(asked)]).sum() / seen.sum().clamp(min=1) + far[len(asked) :].mean()
+            else:
+                weights = torch.cat([seen.float(), torch.ones(len(staying), device=device)])
+                loss = loss + (weights * far).mean()
             stiff = 1.0 if move.d_scales is None or not fades else SHEET_STIFF
             loss = loss + SHAPE_WEIGHT * sum(
                 (weight * change).abs().mean()
