@@ -93,6 +93,11 @@ def cutout_tracks(
     number = np.repeat(np.arange(len(parts)), [len(colors) for _, colors in parts])
     paths = np.concatenate([paths for paths, _ in parts], axis=1)
     way = _common_way(paths, _seen(cutouts, number))
+    for k, cutout in enumerate(cutouts):  # beyond, it goes as all go
+        first, last = np.flatnonzero(cutout.seen)[[0, -1]]
+        own = number == k
+        paths[:first, own] = paths[first, own] + (way[:first] - way[first])[:, None]
+        paths[last + 1 :, own] = paths[last, own] + (way[last + 1 :] - way[last])[:, None]
     _show_nearest(cutouts)
     keys = np.array([cutout.key for cutout in cutouts])
     ahead = np.mean([each.camera.T_cam_world[2, :3] for each in residuals], axis=0).astype(np.float32)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy import ndimage
 from torch import Tensor, nn
 
 from lapgs_wgpu.discovery.tracks import Tracks
@@ -22,6 +23,7 @@ MOVING = 1500  # Gaussians of tracks that a step asks, at most
 HASH_RATE, MLP_RATE = 1e-2, 2e-3  # learning rates: half of those of the preset tiny, twice train.start.MAX_*_RATE
 LAST = 0.05  # of the learning rates, in the end; they fall over the second half
 SHAPE_WEIGHT = 0.1  # of changes of scales and quaternions, which the tracks do not know
+HIDDEN = 0.1  # weight of the places of what is faded, which would else wander before the cameras
 SHEET_STIFF = 10.0  # times as much, of the scales of tracks that fade
 FADED, FADE_WEIGHT = 7.0, 0.03  # logits by which what is not seen loses opacity; weight of the distance from that
 HINGES = 3.0  # of the decoder's units, whose inputs are of the size 1: how much they change over the clip
@@ -60,6 +62,7 @@ def fit_field(
     )
     device = scene.parameters["means"].device
     paths, supported = torch.from_numpy(tracks.paths).to(device), torch.from_numpy(tracks.supported).to(device)
+    beside = torch.from_numpy(ndimage.maximum_filter1d(tracks.supported, 3, axis=0)).to(device)
     moving = torch.arange(still, still + len(tracks.part), device=device)
     order: list[int] = []
     errors: list[float] = []
@@ -83,8 +86,9 @@ def fit_field(
             seen = supported[at, on_track]
             squared = (moved - torch.cat([paths[at, on_track], means[len(asked) :]])).square().sum(dim=1)
             far = (squared + SOFTENING**2).sqrt()
-            if fades:  # few are seen at a time
-                loss = loss + (seen * far[: len(asked)]).sum() / seen.sum().clamp(min=1) + far[len(asked) :].mean()
+            if fades:  # few are seen at a time; between two times, those of both
+                weights = HIDDEN + (1 - HIDDEN) * beside[at, on_track].float()
+                loss = loss + (weights * far[: len(asked)]).sum() / weights.sum() + far[len(asked) :].mean()
             else:
                 weights = torch.cat([seen.float(), torch.ones(len(staying), device=device)])
                 loss = loss + (weights * far).mean()
