@@ -87,21 +87,27 @@ def sky(_: int, pixels: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("change", "level", "told"),
+    ("change", "level", "told", "field"),
     [
-        (lambda i, pixels: pixels, 0, "nothing moves by the masks"),
-        (sky, None, ""),
-        (lambda i, pixels: pixels * (0.4 if i % 2 else 1.0), None, ""),
+        (lambda i, pixels: pixels, 0, "nothing moves by the masks", "laplacian"),
+        (sky, None, "", "laplacian"),
+        (lambda i, pixels: pixels * (0.4 if i % 2 else 1.0), None, "", "grid4d"),
     ],
     ids=["a room without movers", "sky over more than half", "exposure that jumps"],
 )
 def test_a_hard_film_trains(
-    change: Callable[[int, np.ndarray], np.ndarray], level: int | None, told: str, tmp_path: Path, device: Device
+    change: Callable[[int, np.ndarray], np.ndarray],
+    level: int | None,
+    told: str,
+    field: str,
+    tmp_path: Path,
+    device: Device,
 ) -> None:
     capture = write_colmap(tmp_path / "film", device)
     write_masks(capture, level)
     change_images(sorted((capture / "images").glob("*.png")), change)
-    config = load_config("film", QUICK | {"data.path": str(capture), "schedule.steps": "15"})
+    steps = {"data.path": str(capture), "schedule.steps": "15", "field.kind": field}
+    config = load_config("film", QUICK | steps)
     with start_training(config, device=device) as training:
         assert training.discovery is not None
         assert ("nothing is added" in training.discovery) == (level == 0)

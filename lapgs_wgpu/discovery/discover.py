@@ -121,7 +121,9 @@ def scene_with(
     else:
         rows = rows_with(static, tracks, sheets=sheets)
         of_part = DYNAMICS * torch.randn(int(tracks.part.max()) + 1, config.field.dynamics_size, generator=generator)
-        if sheets:  # shown one after another, which a layer of the field can tell by these
+        if (
+            sheets and config.field.dynamics_size > 1
+        ):  # shown one after another, which a layer of the field can tell by these
             when = [tracks.supported[:, tracks.part == k].mean(axis=1) for k in range(len(of_part))]
             middle = np.array([np.average(np.linspace(-1, 1, len(each)), weights=each) for each in when])
             of_part[:, :2] = torch.from_numpy(np.stack([np.ones_like(middle), middle], axis=1)) * SHEET_DYNAMICS

@@ -55,7 +55,7 @@ def fit_field(
         own = {id(parameter) for parameter in head.parameters()}
         groups = [(rate, [each for each in parameters if id(each) not in own]) for rate, parameters in groups]
         groups.append((MLP_RATE / APPEARANCE_SCALE, list(head.parameters())))
-    if fades and isinstance(field, GridField):
+    if fades and isinstance(field, GridField) and field.config.dynamics_size > 1 and field.config.temporal_hash:
         _tell_times(field, generator)
     optimizer = torch.optim.Adam(
         [{"params": parameters, "lr": rate} for rate, parameters in groups], eps=ADAM_EPS, fused=True
@@ -129,9 +129,10 @@ def _tell_times(field: GridField, generator: torch.Generator) -> None:
     """Have the decoder's units begin as hinges in time and in the time of a sheet's code (`discover.scene_with`): what
     moves and fades one after another is made of these. Without a code, as what stands still is, all are zero."""
     with torch.no_grad():
-        for grid in field.temporal_grids:
-            x, y, t = grid.levels[0].resolution
-            grid.table[: x * y * t, 0] = torch.linspace(-1, 1, t).repeat_interleave(x * y)
+        for grid in field.grids[1:]:
+            if grid.levels[0].dense:
+                x, y, t = grid.levels[0].resolution
+                grid.table[: x * y * t, 0] = torch.linspace(-1, 1, t).repeat_interleave(x * y)
         weight, size = field.temporal.weight, field.config.dynamics_size
         weight[:, size] = HINGES * (2 * torch.rand(len(weight), generator=generator) - 1)
         weight[:, 1] = torch.rand(len(weight), generator=generator) * 2 - 1
