@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.captures import bright, write_colmap
+from helpers.captures import bright, write_colmap, write_rig
 from helpers.films import Board, drawn, room_cloud, walk
 from PIL import Image
 
@@ -20,6 +21,7 @@ from lapgs_wgpu.discovery.start_training import start_training
 from lapgs_wgpu.discovery.static_fit import static_fit
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.train.evaluate import evaluate
 from lapgs_wgpu.train.presets import load_config
 
 BOARD = Board(0.4, 0.6, 0.7)
@@ -60,26 +62,80 @@ def test_the_cube_of_movers_holds_them_and_not_the_room() -> None:
     assert mover_cube(Cloud(points, colors.astype(np.float32)), empty) is None
 
 
+QUICK = {"discovery.steps": "10", "discovery.field_steps": "5", "discovery.size": "64", "points.count": "300"}
+
+
+def change_images(files: list[Path], change: Callable[[int, np.ndarray], np.ndarray]) -> None:
+    for i, file in enumerate(files):
+        with Image.open(file) as image:
+            pixels = np.asarray(image.convert("RGB"))
+        Image.fromarray(change(i, pixels).astype(np.uint8)).save(file)
+
+
+def write_masks(capture: Path, level: int | None) -> None:
+    """Masks of a capture's images: of one level, or white where they show something bright."""
+    (capture / "masks").mkdir(exist_ok=True)
+    for file in sorted((capture / "images").glob("*.png")):
+        with Image.open(file) as image:
+            shown = bright(np.asarray(image)) if level is None else np.full(image.size[::-1], level > 0)
+        Image.fromarray(shown.astype(np.uint8) * 255).save(capture / "masks" / file.name)
+
+
+def sky(_: int, pixels: np.ndarray) -> np.ndarray:
+    height = len(pixels)
+    return np.where((np.arange(height) < 0.6 * height)[:, None, None], [150, 190, 240], pixels)
+
+
+@pytest.mark.parametrize(
+    ("change", "level", "told", "field"),
+    [
+        (lambda i, pixels: pixels, 0, "nothing moves by the masks", "laplacian"),
+        (sky, None, "", "laplacian"),
+        (lambda i, pixels: pixels * (0.4 if i % 2 else 1.0), None, "", "grid4d"),
+    ],
+    ids=["a room without movers", "sky over more than half", "exposure that jumps"],
+)
+def test_a_hard_film_trains(
+    change: Callable[[int, np.ndarray], np.ndarray],
+    level: int | None,
+    told: str,
+    field: str,
+    tmp_path: Path,
+    device: Device,
+) -> None:
+    capture = write_colmap(tmp_path / "film", device)
+    write_masks(capture, level)
+    change_images(sorted((capture / "images").glob("*.png")), change)
+    steps = {"data.path": str(capture), "schedule.steps": "15", "field.kind": field}
+    config = load_config("film", QUICK | steps)
+    with start_training(config, device=device) as training:
+        assert training.discovery is not None
+        assert ("nothing is added" in training.discovery) == (level == 0)
+        assert any(told in warning for warning in ["", *training.dataset.warnings])
+        losses = [training.step().loss for _ in range(3)]
+        measured = evaluate(training.scene, training.dataset.test, "black")
+    assert np.isfinite(losses).all()
+    assert 3 < measured["psnr"] < 60
+    assert (measured["psnr_moving"] == "not available") == (level == 0)
+
+
+def test_a_black_camera_of_a_rig_is_told(tmp_path: Path, device: Device) -> None:
+    capture = write_rig(tmp_path / "rig", device)
+    assert not any("is black" in warning for warning in load_dataset(capture).warnings)
+    change_images(sorted((capture / "images" / "cam02").glob("*.png")), lambda i, pixels: pixels * 0)
+    assert any("camera cam02 is black (one of 1 of 4)" in warning for warning in load_dataset(capture).warnings)
+
+
 def test_a_film_starts_from_its_masks(tmp_path: Path, device: Device) -> None:
     capture = write_colmap(tmp_path / "film", device)
-    files = sorted((capture / "images").glob("*.png"))
-
-    def write_masks(level: int | None) -> None:
-        (capture / "masks").mkdir(exist_ok=True)
-        for file in files:
-            with Image.open(file) as image:
-                shown = bright(np.asarray(image)) if level is None else np.full(image.size[::-1], level > 0)
-            Image.fromarray(shown.astype(np.uint8) * 255).save(capture / "masks" / file.name)
-
-    write_masks(255)
+    write_masks(capture, 255)
     with pytest.raises(InputError, match="everything moves"):
         load_dataset(capture, movers="masks")
-    write_masks(0)
+    write_masks(capture, 0)
     assert any("nothing moves" in warning for warning in load_dataset(capture, movers="masks").warnings)
-    write_masks(None)
-    changes = {"data.path": str(capture), "points.count": "300", "density.limit": "500", "schedule.steps": "20"}
-    quick = {"discovery.steps": "10", "discovery.field_steps": "5", "discovery.size": "64"}
-    with start_training(load_config("film", changes | quick), device=device) as training:
+    write_masks(capture, None)
+    changes = {"data.path": str(capture), "density.limit": "500", "schedule.steps": "20"}
+    with start_training(load_config("film", changes | QUICK), device=device) as training:
         assert training.discovery is not None
         assert "moving parts" in training.discovery
         assert all(view.moving is not None for view in (*training.dataset.train, *training.dataset.test))

@@ -32,6 +32,7 @@ MIN_FOCAL, MAX_FOCAL = 0.05, 1000.0  # of an image's longer side: 169 and 0.06 d
 MIN_SEEN = 0.5
 OFF_CENTER = 0.15  # of a side: intrinsics of images half or twice as large lie 0.25 or 0.5 away from the middle
 LOOKED_AT, DARK = 8, 64  # images of 16 bits that are decoded, and the level that a bright one of them reaches
+BLACK_AT, BLACK = 3, 16  # images of a camera that are decoded, and the level that one of them reaches
 MIN_SPREAD = 1e-3  # of the cloud, relative to its distance from the cameras: a smaller one covers less than a pixel
 NAMED = 5  # images that a warning names
 STANDING = 0.01  # cameras with a spread below this, relative to their distance from the cloud, have no parallax
@@ -81,7 +82,23 @@ def check_plausible(frames: Sequence[Frame]) -> list[str]:
         warnings.append(f"{text}, so they seem to use {8 + bits} bits; multiply them by {2 ** (8 - bits)}.")
     if told := _low_levels(transparent, slice(3, 4), "images are nearly transparent", "alpha"):
         warnings.append(f"{told[0]}, and transparent pixels count as background; save the images without alpha.")
-    return warnings
+    return warnings + _black_cameras(frames)
+
+
+def _black_cameras(frames: Sequence[Frame]) -> list[str]:
+    """Warn about cameras of a rig whose images show nothing."""
+    by_camera = dict[str, list[ImageFile]]()
+    for frame in frames:
+        if frame.name.camera and isinstance(frame.image, ImageFile):
+            by_camera.setdefault(frame.name.camera, []).append(frame.image)
+    several = {name: evenly(images, BLACK_AT) for name, images in by_camera.items() if len(images) > 1}
+    black = [name for name, images in several.items() if all(decode(i.path)[..., :3].max() < BLACK for i in images)]
+    if not black:
+        return []
+    return [
+        f"camera {black[0]} is black (one of {len(black)} of {len(several)}): in {len(several[black[0]])} of its "
+        f"{len(by_camera[black[0]])} images, such as {several[black[0]][0]}, no level reaches {BLACK}: leave it out."
+    ]
 
 
 def _low_levels(images: Sequence[ImageFile], channels: slice, what: str, of: str) -> tuple[str, int] | None:

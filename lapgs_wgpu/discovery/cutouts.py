@@ -1,8 +1,9 @@
 """Tracks of what masks say moves in the images of one camera: cut-outs of some images, followed through the others.
 
-A cut-out is what is connected in the mask of one image and not yet explained by earlier ones. It is followed from
+A cut-out is what is connected in the mask of one image and not mostly explained by earlier ones. It is followed from
 image to image by an affine map of its colors (Baker and Matthews, Lucas-Kanade 20 years on, IJCV 2004), until it no
-longer looks alike. It stands upright at the depth of the ground below it.
+longer looks alike. It stands upright at the depth of the ground below it. Each image shows the cut-outs of the nearest
+images alone.
 """
 
 from __future__ import annotations
@@ -24,14 +25,15 @@ ENOUGH = 0.15  # share of an image's moving pixels that may stay unexplained
 BLURS = 4.0, 2.0, 1.0  # pixels; of the images that are compared, one after another
 ITERATIONS = 8  # of each
 PIXELS = 1500  # of a cut-out that are compared, at most
-POINTS = 1000  # of a cut-out, at most
+NEWS = 0.5  # share of what a cut-out explains in an image that none of a nearer image does, at least
+POINTS = 12_000  # of all cut-outs, at most
 ALIKE = 0.12  # difference of two blurred colors that look alike
 LOST = 0.5  # share of a cut-out that must look alike
 VISIBLE = 0.3  # share of a cut-out that must lie in the image
 STIFF = 0.02  # weight of the affine part of a map against that before
 FOOT = 0.15  # of its height: the lowest part of a cut-out, which stands on the ground
 BEFORE = 0.97  # of the depth of the ground
-APART = 0.1, 0.9  # half sides of the box: how far the first and the last cut-out are moved towards the cameras
+APART = -0.5, 0.5  # half sides of the box: how far the first and the last cut-out are moved away from the cameras
 FAR_BELOW = 3  # pixels; the ground that a foot stands on lies so far below
 
 Map = NDArray[np.float64]
@@ -45,12 +47,14 @@ class _Image(NamedTuple):
 
 
 class _Cutout(NamedTuple):
-    """pixels: (n, 2) columns and rows. maps: (T, 2, 3) to the pixels of each image. seen: (T,)."""
+    """pixels: (n, 2) columns and rows. maps: (T, 2, 3) to the pixels of each image. seen: (T,). explained: (T, H, W),
+    what it explains of each mask."""
 
     key: int
     pixels: NDArray[np.int64]
     maps: Map
     seen: NDArray[np.bool_]
+    explained: Mask
 
 
 def cutout_tracks(
@@ -59,44 +63,78 @@ def cutout_tracks(
     """Tracks of what moves in the images of one camera, None where nothing does, and the share of the moving pixels
     that they explain.
 
-    Their positions lie nearer to the cameras than their paths, those of each cut-out by as much again: the field tells
-    Gaussians apart by place.
+    Their positions do not share the way that all go, and those of each cut-out lie apart: the field has less to learn,
+    and it tells Gaussians apart by place.
 
     residuals: images in the order of their times, whose masks say what moves. depths: (H, W) of what stands still in
     each, world units, NaN where unknown. half_side: of the box that the field covers, world units.
     """
     images = [_Image(each, _levels(each)) for each in residuals]
-    masks = [image.residual.mask for image in images]
-    known, rest = [np.zeros_like(mask) for mask in masks], [mask.sum() for mask in masks]
-    size = masks[0].size
+    masks = np.stack([image.residual.mask for image in images])
+    known, least = np.zeros_like(masks), LEAST * masks[0].size
     cutouts: list[_Cutout] = []
-    keys: set[int] = set()
-    while len(cutouts) < MOST:
+    rest = masks.sum(axis=(1, 2))
+    enough = np.maximum(ENOUGH * rest, least)
+    while len(cutouts) < MOST and (rest > enough).any():
         key = int(np.argmax(rest))
-        if rest[key] <= max(ENOUGH * masks[key].sum(), LEAST * size):
-            break
-        labels, count = ndimage.label(ndimage.binary_opening(masks[key] & ~known[key]))
+        labels, count = ndimage.label(ndimage.binary_opening(masks[key]))
         for label in range(1, count + 1):
-            rows, columns = np.nonzero(labels == label)
-            if len(rows) >= LEAST * size:
-                known[key] |= labels == label
-                cutouts.append(_followed(images, key, np.stack([columns, rows], axis=1), known))
-        keys.add(key)
-        rest = [0 if i in keys else (masks[i] & ~known[i]).sum() for i in range(len(masks))]
+            part = labels == label
+            if (part & ~known[key]).sum() > max(ENOUGH * part.sum(), least):
+                rows, columns = np.nonzero(part)
+                cutouts.append(_followed(images, key, np.stack([columns, rows], axis=1)))
+                known |= cutouts[-1].explained
+        enough[key] = np.inf
+        rest = np.where(np.isinf(enough), 0, (masks & ~known).sum(axis=(1, 2)))
     if not cutouts:
         return None, 0.0
-    share = sum(mask.sum() for mask in known) / sum(mask.sum() for mask in masks)
     ground = [_depths(image.residual.mask, depth) for image, depth in zip(images, depths, strict=True)]
-    parts = [_placed(cutout, images, ground) for cutout in cutouts]
+    parts = [_placed(cutout, images, ground, POINTS // len(cutouts)) for cutout in cutouts]
     number = np.repeat(np.arange(len(parts)), [len(colors) for _, colors in parts])
     paths = np.concatenate([paths for paths, _ in parts], axis=1)
-    seen = np.stack([cutout.seen for cutout in cutouts], axis=1)[:, number]
-    keys_of = np.array([cutout.key for cutout in cutouts])[number]
+    way = _common_way(paths, _seen(cutouts, number))
+    for k, cutout in enumerate(cutouts):  # beyond, it goes as all go
+        first, last = np.flatnonzero(cutout.seen)[[0, -1]]
+        own = number == k
+        paths[:first, own] = paths[first, own] + (way[:first] - way[first])[:, None]
+        paths[last + 1 :, own] = paths[last, own] + (way[last + 1 :] - way[last])[:, None]
+    _show_nearest(cutouts)
+    keys = np.array([cutout.key for cutout in cutouts])
     ahead = np.mean([each.camera.T_cam_world[2, :3] for each in residuals], axis=0).astype(np.float32)
-    apart = np.linspace(*APART, len(parts), dtype=np.float32)[np.argsort(np.argsort([c.key for c in cutouts]))]
-    positions = paths[keys_of, np.arange(len(keys_of))] - half_side * apart[number][:, None] * ahead
-    tracks = Tracks(positions, np.concatenate([colors for _, colors in parts]), number, paths, seen)
-    return tracks, float(share)
+    apart = np.linspace(*APART, len(parts), dtype=np.float32)[np.argsort(np.argsort(keys))]
+    positions = (paths - way[:, None])[keys[number], np.arange(len(number))]
+    positions += half_side * apart[number][:, None] * ahead - positions.mean(axis=0)
+    tracks = Tracks(positions, np.concatenate([colors for _, colors in parts]), number, paths, _seen(cutouts, number))
+    return tracks, float((known & masks).sum() / masks.sum())
+
+
+def _seen(cutouts: Sequence[_Cutout], number: NDArray[np.int64]) -> Mask:
+    """(T, n) whether the cut-outs of these numbers (n,) are seen."""
+    return np.stack([cutout.seen for cutout in cutouts], axis=1)[:, number]
+
+
+def _show_nearest(cutouts: Sequence[_Cutout]) -> None:
+    """Have each image show the cut-outs of the nearest images: what a nearer one explains is not shown twice."""
+    for t in range(len(cutouts[0].seen)):
+        known = np.zeros_like(cutouts[0].explained[t])
+        for cutout in sorted(cutouts, key=lambda each: abs(each.key - t)):
+            own = cutout.explained[t]
+            cutout.seen[t] &= bool((own & ~known).sum() > NEWS * own.sum())
+            if cutout.seen[t]:
+                known |= own
+    for cutout in cutouts:  # without a break
+        runs = ndimage.label(cutout.seen)[0]
+        cutout.seen[:] = runs == runs[cutout.key]
+
+
+def _common_way(paths: Floats, seen: Mask) -> Floats:
+    """(T, 3) how far all tracks have moved on average since half of the clip."""
+    steps = np.zeros((len(paths), 3), np.float32)
+    for t in range(1, len(paths)):
+        both = seen[t] & seen[t - 1]
+        steps[t] = (paths[t, both] - paths[t - 1, both]).mean(axis=0) if both.any() else steps[t - 1]
+    way: Floats = np.cumsum(steps, axis=0)
+    return way - way[len(way) // 2]
 
 
 def _levels(residual: Residual) -> list[Floats]:
@@ -109,10 +147,11 @@ def _levels(residual: Residual) -> list[Floats]:
     return levels
 
 
-def _followed(images: Sequence[_Image], key: int, pixels: NDArray[np.int64], known: list[Mask]) -> _Cutout:
-    """Follow a cut-out to both ends of the clip; adds what it explains to what is known (H, W) of each image."""
+def _followed(images: Sequence[_Image], key: int, pixels: NDArray[np.int64]) -> _Cutout:
+    """Follow a cut-out to both ends of the clip."""
     maps, seen = np.tile(np.eye(2, 3), (len(images), 1, 1)), np.zeros(len(images), bool)
-    seen[key] = True
+    explained = np.zeros((len(images), *images[0].residual.mask.shape), bool)
+    seen[key] = explained[key, pixels[:, 1], pixels[:, 0]] = True
     for way in (-1, 1):
         before, step = np.eye(2, 3), np.zeros((2, 3))
         for at in range(key + way, len(images) if way > 0 else -1, way):
@@ -124,8 +163,8 @@ def _followed(images: Sequence[_Image], key: int, pixels: NDArray[np.int64], kno
                 break
             maps[at], seen[at] = found, True
             step, before = found - before, found
-            known[at] |= _explained(images[key], images[at], pixels, found)
-    return _Cutout(key, pixels, maps, seen)
+            explained[at] = _explained(images[key], images[at], pixels, found)
+    return _Cutout(key, pixels, maps, seen, explained)
 
 
 def _registered(source: _Image, target: _Image, pixels: NDArray[np.int64], start: Map) -> tuple[Map, float]:
@@ -212,9 +251,9 @@ def _depths(mask: Mask, depth: Floats) -> Floats:
     return result
 
 
-def _placed(cutout: _Cutout, images: Sequence[_Image], depths: Sequence[Floats]) -> tuple[Floats, Floats]:
-    """The paths (T, n, 3) and colors (n, 3) of a cut-out."""
-    chosen = cutout.pixels[evenly_indices(len(cutout.pixels), POINTS)]
+def _placed(cutout: _Cutout, images: Sequence[_Image], depths: Sequence[Floats], most: int) -> tuple[Floats, Floats]:
+    """The paths (T, n, 3) and colors (n, 3) of a cut-out, of so many points at most."""
+    chosen = cutout.pixels[evenly_indices(len(cutout.pixels), most)]
     x, y = chosen.T
     colors = images[cutout.key].residual.image[y, x]
     at = np.einsum("tij,jn->tin", cutout.maps[:, :, :2], chosen.T) + cutout.maps[:, :, 2:]

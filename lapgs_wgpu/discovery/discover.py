@@ -24,6 +24,7 @@ from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config
 from lapgs_wgpu.train.start import Start
 
 DYNAMICS = 0.5  # standard deviation of the dynamics attribute of a discovered Gaussian, which it shares with its part
+SHEET_DYNAMICS = 2.0  # in place of it: of all sheets, and of the last one's time
 NEARLY_ALL = 0.8  # share of the surface points that tracks explain, above which the field has little left to learn
 RAMP_STEPS = 200  # over which learning rates rise after discovery, where schedule.warm_up is 0
 SHOWN = 2.0 / 255  # least difference from the background of an image that shows something
@@ -120,6 +121,12 @@ def scene_with(
     else:
         rows = rows_with(static, tracks, sheets=sheets)
         of_part = DYNAMICS * torch.randn(int(tracks.part.max()) + 1, config.field.dynamics_size, generator=generator)
+        if (
+            sheets and config.field.dynamics_size > 1
+        ):  # shown one after another, which a layer of the field can tell by these
+            when = [tracks.supported[:, tracks.part == k].mean(axis=1) for k in range(len(of_part))]
+            middle = np.array([np.average(np.linspace(-1, 1, len(each)), weights=each) for each in when])
+            of_part[:, :2] = torch.from_numpy(np.stack([np.ones_like(middle), middle], axis=1)) * SHEET_DYNAMICS
         dynamics = torch.cat([dynamics, of_part[torch.from_numpy(tracks.part)]])
     rows["dynamics"] = dynamics
     return Scene4D(
