@@ -27,6 +27,7 @@ from lapgs_wgpu.data.raytrace import (
     plane_hits,
     solid_hits,
     to_pixels,
+    turn_about_z,
 )
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
@@ -94,8 +95,8 @@ def render(camera: Camera, time: float, frequencies: Sequence[float] = FREQUENCI
     centres = trajectories([time], frequencies)
     surfaces = []
     for toy, f in zip(TOYS, frequencies, strict=False):
-        angle = 2 * np.pi * f * time if toy.turns else 0.0
-        surfaces.append(solid_hits(toy.solid, centres[toy.name][0], camera.position, rays, angle=angle))
+        turn = turn_about_z(2 * np.pi * f * time if toy.turns else 0.0)
+        surfaces.append(solid_hits(toy.solid, centres[toy.name][0], camera.position, rays, turn=turn))
     surfaces.append(plane_hits(2, TABLE_HEIGHT, 1, _table, camera.position, rays))
     color, owner = combine(surfaces, rays.shape[1])
     return to_pixels(color, owner >= 0, camera)

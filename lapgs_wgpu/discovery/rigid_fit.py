@@ -1,0 +1,140 @@
+"""Parts that turn as rigid bodies: their shape and colors, and their turn and shift at each time, fitted by drawing.
+
+A body starts as a ball of Gaussians that turns as `turns` found. Steps of Adam on one image after another fit its
+Gaussians, the light, and smooth corrections of its turn and shift at all times.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lapgs_wgpu.discovery.residual import Residual
+from lapgs_wgpu.discovery.tracks import Tracks
+from lapgs_wgpu.discovery.turns import harmonics, part_radius
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.splat.rasterize import rasterize
+
+POINTS = 300  # of a body
+SPACING = 0.5  # standard deviation of a Gaussian in distances of a body's points, at first
+OPACITY = 1.5  # logit, at first
+STEPS = 1000
+SHAPE_FIRST = 120  # steps before bodies are turned and shifted
+RATES = {"points": 2e-3, "colors": 2e-2, "sizes": 1e-2, "opacities": 3e-2, "light": 5e-3, "turns": 5e-3, "shifts": 1e-3}
+LAST = 0.05  # of these rates, in the end; they fall over the second half
+SMOOTHING = 1.5  # times; standard deviation of the weights that make a turn and a shift of those around
+
+
+def rigid_tracks(
+    tracks: Tracks,
+    rotations: Mapping[int, NDArray[np.float64]],
+    times: NDArray[np.float64],
+    images: Sequence[Residual],
+    device: Device,
+    generator: torch.Generator,
+) -> Tracks:
+    """The tracks, in which the parts of the given rotations (T, 3, 3) at the times (T,) are rigid bodies.
+
+    Other parts are drawn, too, as they are.
+    """
+    parts = list(rotations)
+    radii = torch.tensor([part_radius(tracks, k) for k in parts])
+    others = ~np.isin(tracks.part, parts)
+    R0 = torch.from_numpy(np.stack([rotations[k] for k in parts], axis=1)).float()
+    centers = torch.from_numpy(np.stack([tracks.paths[:, tracks.part == k].mean(axis=1) for k in parts], axis=1))
+    soft_paths, soft_colors = torch.from_numpy(tracks.paths[:, others]), torch.from_numpy(tracks.colors[others])
+    count = len(parts) * POINTS
+    points = _sphere(POINTS) * radii[:, None, None]
+    size = torch.log(SPACING * (4 * np.pi / POINTS) ** 0.5 * radii)[:, None].repeat(1, POINTS).ravel()
+    soft_size = torch.full((int(others.sum()),), float(size.mean()))
+    clock = torch.arange(len(times))
+    near = torch.exp(-0.5 * ((clock[:, None] - clock) / SMOOTHING) ** 2)
+    near = near / near.sum(dim=1, keepdim=True)
+    values = {
+        "points": points,
+        "colors": torch.cat([torch.full((count, 3), 0.4), soft_colors]),
+        "sizes": torch.cat([size, soft_size]),
+        "opacities": torch.full((count + len(soft_size),), OPACITY),
+        "light": torch.eye(9)[0].repeat(len(parts), 1),
+        "turns": torch.zeros(len(times), len(parts), 3),
+        "shifts": torch.zeros(len(times), len(parts), 3),
+    }
+    for value in values.values():
+        value.requires_grad_()
+    optimizer = torch.optim.Adam([{"params": [value], "name": name} for name, value in values.items()])
+
+    def poses(at: int | slice) -> tuple[Tensor, Tensor]:
+        turns, shifts = (torch.tensordot(near[at], values[name], 1) for name in ("turns", "shifts"))
+        return torch.linalg.matrix_exp(_cross(turns)) @ R0[at], centers[at] + shifts
+
+    order: list[int] = []
+    for step in range(STEPS):
+        order = order or torch.randperm(len(images), generator=generator).tolist()
+        image = images[order.pop()]
+        at = int(np.searchsorted(times, image.time))
+        for group in optimizer.param_groups:
+            moves = group["name"] in ("turns", "shifts")
+            rate = RATES[group["name"]] * max(LAST, min(1.0, 2.0 * (STEPS - step) / STEPS))
+            group["lr"] = 0.0 if moves and step < SHAPE_FIRST else rate
+        R, center = poses(at)
+        arms = values["points"] @ R.transpose(1, 2)
+        x, y, z = torch.nn.functional.normalize(arms.detach(), dim=2).unbind(dim=2)
+        lit = (torch.stack(harmonics(x, y, z), dim=2) @ values["light"][:, :, None]).reshape(-1, 1)
+        means = torch.cat([(arms + center[:, None]).reshape(-1, 3), soft_paths[at]])
+        drawn = rasterize(
+            means,
+            torch.tensor([1.0, 0, 0, 0]).repeat(len(means), 1),
+            values["sizes"].exp()[:, None].repeat(1, 3),
+            values["opacities"].sigmoid(),
+            values["colors"] * torch.cat([lit, torch.ones(len(soft_size), 1)]),
+            image.camera,
+            antialiased=True,
+            depth=False,
+            device=device,
+        )
+        picture = drawn.image + (1 - drawn.alpha)[..., None] * torch.from_numpy(image.still)
+        optimizer.zero_grad()
+        (picture - torch.from_numpy(image.image)).abs().sum().backward()
+        optimizer.step()
+    with torch.no_grad():
+        R, center = poses(slice(None))
+        paths = (values["points"] @ R.transpose(2, 3) + center[:, :, None]).flatten(1, 2).numpy()
+    return _with_bodies(tracks, parts, others, paths, values["colors"].detach()[:count].numpy())
+
+
+def _with_bodies(
+    tracks: Tracks, parts: list[int], others: NDArray[np.bool_], paths: NDArray[np.float32], colors: NDArray[np.float32]
+) -> Tracks:
+    """The other tracks, and those of the bodies at the times at which the parts were found."""
+    part, positions, supported = np.repeat(parts, POINTS), np.empty((len(colors), 3), np.float32), []
+    for n, k in enumerate(parts):
+        own, members = slice(n * POINTS, (n + 1) * POINTS), tracks.part == k
+        away = np.linalg.norm(tracks.paths[:, members].mean(axis=1) - tracks.positions[members].mean(axis=0), axis=1)
+        positions[own] = paths[int(away.argmin()), own]
+        supported.append(np.repeat(tracks.supported[:, members][:, :1], POINTS, axis=1))
+    return Tracks(
+        np.concatenate([tracks.positions[others], positions]),
+        np.concatenate([tracks.colors[others], colors.clip(0, 1)]),
+        np.concatenate([tracks.part[others], part]),
+        np.concatenate([tracks.paths[:, others], paths], axis=1),
+        np.concatenate([tracks.supported[:, others], *supported], axis=1),
+    )
+
+
+def _sphere(count: int) -> Tensor:
+    """(count, 3) points spread over the unit sphere, along a spiral."""
+    height = 1 - (2 * np.arange(count) + 1) / count
+    angle = np.pi * (1 + 5**0.5) * np.arange(count)
+    wide = np.sqrt(1 - height**2)
+    return torch.from_numpy(np.stack([wide * np.cos(angle), wide * np.sin(angle), height], axis=1)).float()
+
+
+def _cross(vectors: Tensor) -> Tensor:
+    """(..., 3, 3) matrices of the cross product with vectors (..., 3)."""
+    x, y, z = vectors.unbind(dim=-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
