@@ -6,15 +6,18 @@ import time
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.discovery.acceptance import explained_share, rows_with, tracks_in_images
 from lapgs_wgpu.discovery.cutouts import cutout_tracks
 from lapgs_wgpu.discovery.field_fit import fit_field
+from lapgs_wgpu.discovery.rigid_fit import rigid_tracks
 from lapgs_wgpu.discovery.static_fit import static_fit
 from lapgs_wgpu.discovery.surface_points import surface_points
 from lapgs_wgpu.discovery.tracks import Tracks, find_tracks
+from lapgs_wgpu.discovery.turns import find_turns
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import Scene4D
@@ -74,6 +77,11 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
     if share < config.discovery.least:
         tracks = None
     generator = torch.Generator().manual_seed(config.seed)
+    turning: dict[int, NDArray[np.float64]] = {}
+    if tracks is not None and not sheets:
+        united, turning = find_turns(tracks, times, images)
+        if turning:
+            tracks = rigid_tracks(united, turning, times, images, device, generator)
     scene = scene_with(static, tracks, config, device, generator, own_field, sheets=sheets)
     found = f"{share:.1%} of what it lacks can be followed: nothing is added"
     if tracks is not None:
@@ -84,7 +92,7 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
             found = f"{share:.1%} of what it lacks can be followed, and the field moves nothing: nothing is added"
     if tracks is not None:
         found = (
-            f"{len(np.unique(tracks.part))} moving parts with {len(tracks.part)} Gaussians, {share:.0%} of what it "
+            f"{len(np.unique(tracks.part))} moving parts ({len(turning)} turn as rigid bodies) with {len(tracks.part)} Gaussians, {share:.0%} of what it "
             f"lacks, followed within {error:.3f} world units"
         )
     order = morton_order(scene.parameters["means"].detach())

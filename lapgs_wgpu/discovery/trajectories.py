@@ -8,10 +8,12 @@ trajectories as a second opinion, since it goes astray where things are fast, hi
 
 from __future__ import annotations
 
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 
 from lapgs_wgpu.data.timestamps import time_step
 from lapgs_wgpu.discovery.residual import Floats
@@ -30,6 +32,10 @@ WINDOW = 1.0  # time steps; standard deviation of the weights by which a path is
 # In half sides of the box:
 BEND = 0.3  # standard deviation of a group's center around the straight continuation of its path
 STEP = 0.7  # from one time to the next, at most
+REACHES = 0.5, 0.25, 0.12  # within twice this a path may be given a group, in rounds
+SAME, TOGETHER = 0.12, 0.3  # paths closer than this at such a share of the times follow one thing
+MEETING = 0.6  # paths that meet come so near
+MEET_TIMES, MEET_GAP = 6, 2  # time steps before and after a meeting that tell who is who; those around it that do not
 
 
 class Trajectory(NamedTuple):
@@ -59,14 +65,14 @@ def find_trajectories(clouds: PointClouds, link: float, half_side: float) -> lis
     """
     clock = clouds.times / time_step(clouds.times)
     groups = _groups(clouds, clock, link)
-    trajectories: list[Trajectory] = []
-    while len(trajectories) < MOST:
+    paths: list[list[int]] = []
+    while len(paths) < MOST:
         path, worth = _best_path(groups, len(clouds.times), half_side)
         if worth < LEAST_WORTH:
             break
         groups.worth[path] *= AGAIN
-        trajectories.append(_smooth(groups, path, clock))
-    return trajectories
+        paths.append(path)
+    return [_smooth(groups, path, clock, WINDOW) for path in _one_to_one(groups, paths, clock, half_side)]
 
 
 def _groups(clouds: PointClouds, clock: NDArray[np.float64], link: float) -> _Groups:
@@ -126,12 +132,82 @@ def _best_path(groups: _Groups, times: int, half_side: float) -> tuple[list[int]
     return path[::-1], total
 
 
-def _smooth(groups: _Groups, path: list[int], clock: NDArray[np.float64]) -> Trajectory:
-    """The path at every time (T,): a straight line fitted to the groups around it, by weights that fall off in time."""
+def _one_to_one(
+    groups: _Groups, paths: list[list[int]], clock: NDArray[np.float64], half_side: float
+) -> list[list[int]]:
+    """The paths, to which the groups of each time are given all at once, each to one (the Hungarian method).
+
+    Paths that meet then part in the way in which both bend least. What is left with too few groups is no path.
+    """
+    if len(paths) < 2:
+        return paths
+    for reach in REACHES:
+        _uncross(groups, paths, clock, half_side)
+        centers = np.stack([_smooth(groups, path, clock, WINDOW, alone=True).centers for path in paths])
+        colors = np.stack([np.median(groups.colors[path], axis=0) for path in paths])
+        given: list[list[int]] = [[] for _ in paths]
+        for i in range(len(clock)):
+            here = np.flatnonzero(groups.time == i)
+            away = np.linalg.norm(centers[:, i, None] - groups.centers[here], axis=2) / (reach * half_side)
+            change = ((colors[:, None] - groups.colors[here]) ** 2).sum(axis=2) / (2 * COLOR_SPREAD**2)
+            cost = away**2 + 0.5 * np.minimum(SHARP, change)
+            for row, column in zip(*linear_sum_assignment(np.minimum(cost, 4.0)), strict=True):
+                if away[row, column] < 2:
+                    given[row].append(int(here[column]))
+        paths = []
+        for path in sorted(given, key=len, reverse=True):  # of two that follow one thing, the one with more groups stays
+            center = _smooth(groups, path, clock, WINDOW).centers if len(path) >= LEAST_WORTH else None
+            known = (_smooth(groups, other, clock, WINDOW).centers for other in paths)
+            if center is not None and all(
+                np.quantile(np.linalg.norm(center - other, axis=1), TOGETHER) > SAME * half_side for other in known
+            ):
+                paths.append(path)
+    return paths
+
+
+def _uncross(groups: _Groups, paths: list[list[int]], clock: NDArray[np.float64], half_side: float) -> None:
+    """Exchange the ends of two paths after they met, where both then bend less."""
+    for a, b in combinations(range(len(paths)), 2):
+        apart = np.linalg.norm(
+            _smooth(groups, paths[a], clock, WINDOW).centers - _smooth(groups, paths[b], clock, WINDOW).centers, axis=1
+        )
+        lowest = [
+            i
+            for i in range(1, len(clock) - 1)
+            if apart[i] < MEETING * half_side and apart[i] == apart[max(0, i - MEET_TIMES) : i + MEET_TIMES + 1].min()
+        ]
+        for i in lowest:
+            before, after = ([[g for g in paths[n] if (groups.time[g] > i) == late] for n in (a, b)] for late in (False, True))
+            bends = [
+                sum(_bend(groups, one, other, clock[i]) for one, other in zip(before, ends, strict=True))
+                for ends in (after, after[::-1])
+            ]
+            if bends[1] < bends[0]:
+                paths[a], paths[b] = before[0] + after[1], before[1] + after[0]
+
+
+def _bend(groups: _Groups, before: list[int], after: list[int], moment: float) -> float:
+    """Squared distances from a parabola of the groups of a path shortly before and after a moment."""
+    around = [g for g in before + after if MEET_GAP < abs(groups.clock[g] - moment) <= MEET_GAP + MEET_TIMES]
+    if len(around) < 6:
+        return 0.0
+    basis = np.vander((groups.clock[around] - moment) / MEET_TIMES, 3)
+    fitted = basis @ np.linalg.lstsq(basis, groups.centers[around], rcond=None)[0]
+    return float(np.square(groups.centers[around] - fitted).sum())
+
+
+def _smooth(
+    groups: _Groups, path: list[int], clock: NDArray[np.float64], window: float, *, alone: bool = False
+) -> Trajectory:
+    """The path at every time (T,): a straight line fitted to the groups around it, by weights that fall off in time.
+
+    alone: whether by those of other times alone."""
     centers = groups.centers[path]
     lapses = groups.clock[path] - clock[:, None]
     nearest = np.abs(lapses).min(axis=1)[:, None]
-    weights = np.exp(-0.5 * (lapses / (WINDOW + nearest)) ** 2)
+    weights = np.exp(-0.5 * (lapses / (window + nearest)) ** 2)
+    if alone:
+        weights *= lapses != 0
     result = np.zeros((len(clock), 3), np.float32)
     for i, (weight, lapse) in enumerate(zip(weights, lapses, strict=True)):
         basis = np.stack([np.ones_like(lapse), lapse], axis=1)

@@ -8,6 +8,7 @@ its image fits best what is known of the ball, near the turn that goes on as bef
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,11 +25,11 @@ Doubles = NDArray[np.float64]
 PIXELS = 2000  # of an image, at most
 SAMPLES = 150  # of a part in an image, at most
 LEAST_SAMPLES = 10
-ROUND = 1.25  # radius of the ball in median distances of a part's points from its center
+ROUND = 0.9  # quantile of the distances of a part's points from its center that is the radius of the ball
 RIM = 0.9  # radii of the ball; beyond, pixels are mixed with what lies behind
 OVERLAP = 1.2  # radii of another part, within which pixels may show that one
 DARK = 0.2  # least light, of the mean brightness
-KEYS = 5  # times around which the turn is looked for
+KEYS = 3  # times around which the turn is looked for
 REACH = 3, 5  # times on either side, in the rough search and in the finer ones
 FASTEST = 36.0  # degrees from one time to the next
 STEPS = 8.0, 4.0, 2.0  # degrees, of the rough search and the finer ones
@@ -55,12 +56,14 @@ def harmonics(x: Any, y: Any, z: Any) -> list[Any]:
 
 def part_radius(tracks: Tracks, k: int) -> float:
     """Radius of the ball around part k."""
-    positions = tracks.positions[tracks.part == k]
-    return ROUND * float(np.median(np.linalg.norm(positions - positions.mean(axis=0), axis=1)))
+    paths = tracks.paths[:, tracks.part == k]
+    return float(np.quantile(np.linalg.norm(paths - paths.mean(axis=1, keepdims=True), axis=2), ROUND))
 
 
-def find_turns(tracks: Tracks, times: Doubles, images: Sequence[Residual]) -> dict[int, Doubles]:
-    """Of each part that turns, its rotations (T, 3, 3) at the times (T,), from whatever orientation."""
+def find_turns(tracks: Tracks, times: Doubles, images: Sequence[Residual]) -> tuple[Tracks, dict[int, Doubles]]:
+    """The tracks, of whose parts those that are at one place are united, and by the number of each part that turns its
+    rotations (T, 3, 3) at the times (T,), from whatever orientation."""
+    tracks = _united(tracks)
     parts = range(int(tracks.part.max()) + 1)
     centers = np.stack([tracks.paths[:, tracks.part == k].mean(axis=1) for k in parts], axis=1)
     radii = np.array([part_radius(tracks, k) for k in parts])
@@ -70,11 +73,25 @@ def find_turns(tracks: Tracks, times: Doubles, images: Sequence[Residual]) -> di
         if sum(len(look.places) > 0 for look in looks) < 2 * max(REACH) + 1:
             continue
         R = _turns(looks)
-        turned, still = ([look.places @ each for look, each in zip(looks, S, strict=True)] for S in (R, 0 * R + np.eye(3)))
         colors = np.concatenate([look.colors for look in looks])
-        if _explained(np.concatenate(turned), colors) - _explained(np.concatenate(still), colors) >= GAIN:
+        turned, still = (
+            _explained(np.concatenate([look.places @ each for look, each in zip(looks, S, strict=True)]), colors)
+            for S in (R, [np.eye(3)] * len(R))
+        )
+        if turned - still >= GAIN:
             found[k] = R
-    return found
+    return tracks, found
+
+
+def _united(tracks: Tracks) -> Tracks:
+    """The tracks, with one number for parts whose centers stay within half a radius of each other."""
+    numbers = np.arange(int(tracks.part.max()) + 1)
+    centers = [tracks.paths[:, tracks.part == k].mean(axis=1) for k in numbers]
+    for a, b in combinations(numbers, 2):
+        near = 0.5 * min(part_radius(tracks, a), part_radius(tracks, b))
+        if np.median(np.linalg.norm(centers[a] - centers[b], axis=1)) < near:
+            numbers[numbers == numbers[b]] = numbers[a]
+    return tracks._replace(part=np.unique(numbers, return_inverse=True)[1].ravel()[tracks.part])
 
 
 def _looks(k: int, times: Doubles, centers: Floats, radii: Doubles, images: Sequence[Residual]) -> list[_Look]:
