@@ -120,7 +120,6 @@ class MovingObject:
         left = 1 - np.clip((time - start) / (end - start), 0, 1)
         return path + self.drop * left * left * (3 - 2 * left) * [0, 0, 1]
 
-
     def turn(self, time: float) -> Floats:
         """(3, 3) its rotation at a time."""
         if not self.turns:

@@ -22,6 +22,7 @@ Vector = tuple[float, float, float]
 Color = tuple[float, float, float]
 
 SAMPLES = 3  # a pixel is the mean of SAMPLES x SAMPLES rays
+UPRIGHT = np.eye(3)  # no turn
 LIGHT = np.array([0.30, -0.35, 0.887])  # unit vector towards the light
 AMBIENT, SKY, DIFFUSE = 0.42, 0.13, 0.45  # sum to 1; SKY: how much more light comes from above than from the side
 
@@ -61,7 +62,7 @@ def pixel_rays(camera: Camera) -> Floats:
 
 
 def solid_hits(
-    solid: Solid, centre: Floats, eye: Floats, rays: Floats, *, turn: Floats = np.eye(3), among: Ints | None = None
+    solid: Solid, centre: Floats, eye: Floats, rays: Floats, *, turn: Floats = UPRIGHT, among: Ints | None = None
 ) -> Hits:
     """Where rays (3, N) from `eye` first meet a solid.
 

@@ -92,9 +92,11 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
             found = f"{share:.1%} of what it lacks can be followed, and the field moves nothing: nothing is added"
     if tracks is not None:
         found = (
-            f"{len(np.unique(tracks.part))} moving parts ({len(turning)} turn as rigid bodies) with {len(tracks.part)} Gaussians, {share:.0%} of what it "
+            f"{len(np.unique(tracks.part))} moving parts with {len(tracks.part)} Gaussians, {share:.0%} of what it "
             f"lacks, followed within {error:.3f} world units"
         )
+        if turning:
+            found += f", {len(turning)} of them as rigid bodies"
     order = morton_order(scene.parameters["means"].detach())
     for name, values in scene.parameters.items():
         scene.parameters[name] = torch.nn.Parameter(values.detach()[order])

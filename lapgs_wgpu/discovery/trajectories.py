@@ -4,6 +4,9 @@ The points of a time form groups. Dynamic programming links the groups of all ti
 them and bends least; the groups on it are then worth less, and the next path is looked for. A path may leap over times
 at which nothing is seen, and may turn sharply a few times. What follows parts step by step (`tracks`) takes the
 trajectories as a second opinion, since it goes astray where things are fast, hidden, or turn sharply.
+
+Paths that were found one after another share groups, and change over where things meet. So the groups of each time are
+then given to all paths at once, one to one, and paths that meet part in the way in which they bend least.
 """
 
 from __future__ import annotations
@@ -135,10 +138,8 @@ def _best_path(groups: _Groups, times: int, half_side: float) -> tuple[list[int]
 def _one_to_one(
     groups: _Groups, paths: list[list[int]], clock: NDArray[np.float64], half_side: float
 ) -> list[list[int]]:
-    """The paths, to which the groups of each time are given all at once, each to one (the Hungarian method).
-
-    Paths that meet then part in the way in which both bend least. What is left with too few groups is no path.
-    """
+    """The paths, to which the groups of each time are given all at once, each to one (the Hungarian method). What is
+    left with too few groups, or follows what another path follows, is no path."""
     if len(paths) < 2:
         return paths
     for reach in REACHES:
@@ -155,7 +156,9 @@ def _one_to_one(
                 if away[row, column] < 2:
                     given[row].append(int(here[column]))
         paths = []
-        for path in sorted(given, key=len, reverse=True):  # of two that follow one thing, the one with more groups stays
+        for path in sorted(
+            given, key=len, reverse=True
+        ):  # of two that follow one thing, the one with more groups stays
             center = _smooth(groups, path, clock, WINDOW).centers if len(path) >= LEAST_WORTH else None
             known = (_smooth(groups, other, clock, WINDOW).centers for other in paths)
             if center is not None and all(
@@ -177,7 +180,8 @@ def _uncross(groups: _Groups, paths: list[list[int]], clock: NDArray[np.float64]
             if apart[i] < MEETING * half_side and apart[i] == apart[max(0, i - MEET_TIMES) : i + MEET_TIMES + 1].min()
         ]
         for i in lowest:
-            before, after = ([[g for g in paths[n] if (groups.time[g] > i) == late] for n in (a, b)] for late in (False, True))
+            before = [[g for g in paths[n] if groups.time[g] <= i] for n in (a, b)]
+            after = [[g for g in paths[n] if groups.time[g] > i] for n in (a, b)]
             bends = [
                 sum(_bend(groups, one, other, clock[i]) for one, other in zip(before, ends, strict=True))
                 for ends in (after, after[::-1])

@@ -104,8 +104,8 @@ def _looks(k: int, times: Doubles, centers: Floats, radii: Doubles, images: Sequ
         d = rays.directions / np.linalg.norm(rays.directions, axis=1, keepdims=True)
         along = d @ to.T
         beside = (to**2).sum(axis=1) - along**2  # (n, p) squared distances of rays and centers
-        shows = (beside[:, k] < (RIM * radii[k]) ** 2) & (beside[:, others] > (OVERLAP * radii[others]) ** 2).all(axis=1)
-        chosen = np.flatnonzero(shows)
+        hidden = (beside[:, others] < (OVERLAP * radii[others]) ** 2).any(axis=1)
+        chosen = np.flatnonzero((beside[:, k] < (RIM * radii[k]) ** 2) & ~hidden)
         if len(chosen) < LEAST_SAMPLES:
             continue
         chosen = chosen[evenly_indices(len(chosen), SAMPLES)]
@@ -128,7 +128,7 @@ def _unlit(looks: list[_Look]) -> list[_Look]:
 
 
 def _cells(places: Doubles, size: float) -> tuple[NDArray[np.int64], int]:
-    """(...) numbers of the cells of a cubic grid in which points (..., 3) of the unit sphere lie; cells along an axis."""
+    """(...) numbers of the cells of a cubic grid in which places (..., 3) lie, and how many it has along an axis."""
     side = int(2 / size) + 3
     index = np.floor(places / size).astype(np.int64) + side // 2
     return (index[..., 0] * side + index[..., 1]) * side + index[..., 2], side
@@ -201,7 +201,7 @@ def _turn_of(look: _Look, expected: Doubles, sums: Doubles) -> Doubles:
     total, mean = sums[0].sum(), sums[1:].sum(axis=(1, 2, 3)) / sums[0].sum()
     count, *blurred = (gaussian_filter(each, BLUR, mode="constant", truncate=2.5).ravel() for each in sums)
     unknown = 1e-5 * total
-    known = np.stack([(each + unknown * one) / (count + unknown) for each, one in zip(blurred, mean, strict=True)], axis=1)
+    known = ((np.array(blurred) + unknown * mean[:, None]) / (count + unknown)).T
     variance = max(float(look.colors.var(axis=0).sum()), 1e-6)
     best = expected
     for step, half in AROUND:
