@@ -280,7 +280,8 @@ def test_a_part_that_turns_becomes_a_rigid_body(device: Device, monkeypatch: pyt
     times = np.linspace(0, 1, 40)
     united, found = find_turns(tracks, times, images)
     assert degrees_beside(found[0], true).mean() < 15
-    rigid = rigid_fit.rigid_tracks(united, found, times, images, device, torch.Generator().manual_seed(0))
+    rigid, bodies = rigid_fit.rigid_tracks(united, found, times, images, device, torch.Generator().manual_seed(0))
+    assert bodies == 1
     arms = rigid.paths - rigid.paths.mean(axis=1, keepdims=True)
     left, _, right = np.linalg.svd(np.einsum("tni,nj->tij", arms, arms[20]))
     assert np.quantile(degrees_beside(left @ right, true), 0.9) < 6

@@ -6,7 +6,6 @@ import time
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import nn
 
 from lapgs_wgpu.data.views import Dataset
@@ -77,11 +76,12 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
     if share < config.discovery.least:
         tracks = None
     generator = torch.Generator().manual_seed(config.seed)
-    turning: dict[int, NDArray[np.float64]] = {}
+    bodies = 0
     if tracks is not None and not sheets:
-        united, turning = find_turns(tracks, times, images)
-        if turning:
-            tracks = rigid_tracks(united, turning, times, images, device, generator)
+        united, turns = find_turns(tracks, times, images)
+        if turns:
+            turned, bodies = rigid_tracks(united, turns, times, images, device, generator)
+            tracks = turned if bodies else tracks
     scene = scene_with(static, tracks, config, device, generator, own_field, sheets=sheets)
     found = f"{share:.1%} of what it lacks can be followed: nothing is added"
     if tracks is not None:
@@ -95,8 +95,8 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
             f"{len(np.unique(tracks.part))} moving parts with {len(tracks.part)} Gaussians, {share:.0%} of what it "
             f"lacks, followed within {error:.3f} world units"
         )
-        if turning:
-            found += f", {len(turning)} of them as rigid bodies"
+        if bodies:
+            found += f", {bodies} of them as rigid bodies"
     order = morton_order(scene.parameters["means"].detach())
     for name, values in scene.parameters.items():
         scene.parameters[name] = torch.nn.Parameter(values.detach()[order])

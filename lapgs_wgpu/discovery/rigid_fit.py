@@ -7,6 +7,7 @@ Gaussians, the light, and smooth corrections of its turn and shift at all times.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -22,10 +23,11 @@ from lapgs_wgpu.splat.rasterize import rasterize
 POINTS = 300  # of a body
 SPACING = 0.5  # standard deviation of a Gaussian in distances of a body's points, at first
 OPACITY = 1.5  # logit, at first
-STEPS = 1000
+STEPS = 600  # twice as many wander off where things turn by 15 degrees and more from one time to the next
 SHAPE_FIRST = 120  # steps before bodies are turned and shifted
 RATES = {"points": 2e-3, "colors": 2e-2, "sizes": 1e-2, "opacities": 3e-2, "light": 5e-3, "turns": 5e-3, "shifts": 1e-3}
 LAST = 0.05  # of these rates, in the end; they fall over the second half
+UNEXPLAINED = 0.3  # of what the static fit lacks where a body is: more is left over of what is not rigid
 SMOOTHING = 1.5  # times; standard deviation of the weights that make a turn and a shift of those around
 
 
@@ -36,10 +38,10 @@ def rigid_tracks(
     images: Sequence[Residual],
     device: Device,
     generator: torch.Generator,
-) -> Tracks:
-    """The tracks, in which the parts of the given rotations (T, 3, 3) at the times (T,) are rigid bodies.
+) -> tuple[Tracks, int]:
+    """The tracks, in which the parts of the given rotations (T, 3, 3) at the times (T,) are rigid bodies, and how many.
 
-    Other parts are drawn, too, as they are.
+    Other parts are drawn, too, as they are, and so stay those of which too little of the images is explained.
     """
     parts = list(rotations)
     radii = torch.tensor([part_radius(tracks, k) for k in parts])
@@ -72,6 +74,7 @@ def rigid_tracks(
         return torch.linalg.matrix_exp(_cross(turns)) @ R0[at], centers[at] + shifts
 
     order: list[int] = []
+    errors = np.zeros((2, len(parts)))  # of the static fit and of the drawing, where a part is, at the end
     for step in range(STEPS):
         order = order or torch.randperm(len(images), generator=generator).tolist()
         image = images[order.pop()]
@@ -97,32 +100,56 @@ def rigid_tracks(
             device=device,
         )
         picture = drawn.image + (1 - drawn.alpha)[..., None] * torch.from_numpy(image.still)
+        difference = (picture - torch.from_numpy(image.image)).abs()
         optimizer.zero_grad()
-        (picture - torch.from_numpy(image.image)).abs().sum().backward()
+        difference.sum().backward()
         optimizer.step()
+        if step >= STEPS - len(images):
+            absolute = np.abs(image.still - image.image), difference.numpy(force=True)
+            for n, where in enumerate(_shown(image, center.numpy(force=True), radii.numpy())):
+                errors[:, n] += [each[where].sum() for each in absolute]
+    rigid = errors[1] < UNEXPLAINED * errors[0]
     with torch.no_grad():
         R, center = poses(slice(None))
-        paths = (values["points"] @ R.transpose(2, 3) + center[:, :, None]).flatten(1, 2).numpy()
-    return _with_bodies(tracks, parts, others, paths, values["colors"].detach()[:count].numpy())
+        paths = (values["points"] @ R.transpose(2, 3) + center[:, :, None]).numpy()
+        colors = values["colors"][:count].clamp(0, 1).reshape(len(parts), POINTS, 3).numpy()
+    bodies = [_Body(k, paths[:, n], colors[n]) for n, k in enumerate(parts) if rigid[n]]
+    return _with_bodies(tracks, bodies), len(bodies)
 
 
-def _with_bodies(
-    tracks: Tracks, parts: list[int], others: NDArray[np.bool_], paths: NDArray[np.float32], colors: NDArray[np.float32]
-) -> Tracks:
-    """The other tracks, and those of the bodies at the times at which the parts were found."""
-    part, positions, supported = np.repeat(parts, POINTS), np.empty((len(colors), 3), np.float32), []
-    for n, k in enumerate(parts):
-        own, members = slice(n * POINTS, (n + 1) * POINTS), tracks.part == k
+class _Body(NamedTuple):
+    """part: whose place it takes. paths: (T, POINTS, 3). colors: (POINTS, 3)."""
+
+    part: int
+    paths: NDArray[np.float32]
+    colors: NDArray[np.float32]
+
+
+def _with_bodies(tracks: Tracks, bodies: list[_Body]) -> Tracks:
+    """The tracks, with bodies in place of parts; their positions are those at the times where the parts were found."""
+    others = ~np.isin(tracks.part, [body.part for body in bodies])
+    kept = tracks.paths[:, others], tracks.supported[:, others]
+    parts = [(tracks.positions[others], tracks.colors[others], tracks.part[others], *kept)]
+    for body in bodies:
+        members = tracks.part == body.part
         away = np.linalg.norm(tracks.paths[:, members].mean(axis=1) - tracks.positions[members].mean(axis=0), axis=1)
-        positions[own] = paths[int(away.argmin()), own]
-        supported.append(np.repeat(tracks.supported[:, members][:, :1], POINTS, axis=1))
+        number, supported = np.full(POINTS, body.part), np.repeat(tracks.supported[:, members][:, :1], POINTS, axis=1)
+        parts.append((body.paths[int(away.argmin())], body.colors, number, body.paths, supported))
+    positions, colors, part, paths, supported = zip(*parts, strict=True)
     return Tracks(
-        np.concatenate([tracks.positions[others], positions]),
-        np.concatenate([tracks.colors[others], colors.clip(0, 1)]),
-        np.concatenate([tracks.part[others], part]),
-        np.concatenate([tracks.paths[:, others], paths], axis=1),
-        np.concatenate([tracks.supported[:, others], *supported], axis=1),
-    )
+        np.concatenate(positions), np.concatenate(colors), np.concatenate(part), np.concatenate(paths, axis=1),
+        np.concatenate(supported, axis=1),
+    )  # fmt: skip
+
+
+def _shown(image: Residual, centers: NDArray[np.float32], radii: NDArray[np.float32]) -> list[NDArray[np.bool_]]:
+    """For each ball (n, 3) of these radii (n,) the moving pixels (H, W) within its outline."""
+    middles, depths = image.camera.project(centers.astype(np.float64))
+    rows, columns = np.indices(image.mask.shape) + 0.5
+    return [
+        image.mask & (np.hypot(columns - x, rows - y) < image.camera.K[0, 0] * radius / depth)
+        for (x, y), depth, radius in zip(middles, np.maximum(depths, 1e-6), radii, strict=True)
+    ]
 
 
 def _sphere(count: int) -> Tensor:

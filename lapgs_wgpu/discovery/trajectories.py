@@ -5,8 +5,9 @@ them and bends least; the groups on it are then worth less, and the next path is
 at which nothing is seen, and may turn sharply a few times. What follows parts step by step (`tracks`) takes the
 trajectories as a second opinion, since it goes astray where things are fast, hidden, or turn sharply.
 
-Paths that were found one after another share groups, and change over where things meet. So the groups of each time are
-then given to all paths at once, one to one, and paths that meet part in the way in which they bend least.
+Paths that were found one after another share groups, and change over where things meet. So as many paths as there
+usually are groups are given the groups of each time at once, one to one, and paths that meet part in the way in which
+they bend least.
 """
 
 from __future__ import annotations
@@ -30,13 +31,13 @@ AGAIN = 0.1  # worth of a group that is on an earlier path
 LEAST_WORTH = 8.0  # of a path
 MOST = 8  # paths
 COLOR_SPREAD = 0.15
+AT_ONCE = 0.75  # quantile, over the times, of the number of groups: so many paths are given groups one to one
 SHARP = 2.0  # highest cost of a bend, and of a change of color
 WINDOW = 1.0  # time steps; standard deviation of the weights by which a path is smoothed
 # In half sides of the box:
 BEND = 0.3  # standard deviation of a group's center around the straight continuation of its path
 STEP = 0.7  # from one time to the next, at most
 REACHES = 0.5, 0.25, 0.12  # within twice this a path may be given a group, in rounds
-SAME, TOGETHER = 0.12, 0.3  # paths closer than this at such a share of the times follow one thing
 MEETING = 0.6  # paths that meet come so near
 MEET_TIMES, MEET_GAP = 6, 2  # time steps before and after a meeting that tell who is who; those around it that do not
 
@@ -75,7 +76,9 @@ def find_trajectories(clouds: PointClouds, link: float, half_side: float) -> lis
             break
         groups.worth[path] *= AGAIN
         paths.append(path)
-    return [_smooth(groups, path, clock, WINDOW) for path in _one_to_one(groups, paths, clock, half_side)]
+    at_once = int(np.quantile(np.bincount(groups.time, minlength=len(clock)), AT_ONCE))
+    paths = _one_to_one(groups, paths[:at_once], clock, half_side) + paths[at_once:]
+    return [_smooth(groups, path, clock) for path in paths if path]
 
 
 def _groups(clouds: PointClouds, clock: NDArray[np.float64], link: float) -> _Groups:
@@ -138,13 +141,12 @@ def _best_path(groups: _Groups, times: int, half_side: float) -> tuple[list[int]
 def _one_to_one(
     groups: _Groups, paths: list[list[int]], clock: NDArray[np.float64], half_side: float
 ) -> list[list[int]]:
-    """The paths, to which the groups of each time are given all at once, each to one (the Hungarian method). What is
-    left with too few groups, or follows what another path follows, is no path."""
+    """The paths, to which the groups of each time are given all at once, each to one (the Hungarian method)."""
     if len(paths) < 2:
         return paths
     for reach in REACHES:
         _uncross(groups, paths, clock, half_side)
-        centers = np.stack([_smooth(groups, path, clock, WINDOW, alone=True).centers for path in paths])
+        centers = np.stack([_smooth(groups, path, clock, alone=True).centers for path in paths])
         colors = np.stack([np.median(groups.colors[path], axis=0) for path in paths])
         given: list[list[int]] = [[] for _ in paths]
         for i in range(len(clock)):
@@ -155,16 +157,7 @@ def _one_to_one(
             for row, column in zip(*linear_sum_assignment(np.minimum(cost, 4.0)), strict=True):
                 if away[row, column] < 2:
                     given[row].append(int(here[column]))
-        paths = []
-        for path in sorted(
-            given, key=len, reverse=True
-        ):  # of two that follow one thing, the one with more groups stays
-            center = _smooth(groups, path, clock, WINDOW).centers if len(path) >= LEAST_WORTH else None
-            known = (_smooth(groups, other, clock, WINDOW).centers for other in paths)
-            if center is not None and all(
-                np.quantile(np.linalg.norm(center - other, axis=1), TOGETHER) > SAME * half_side for other in known
-            ):
-                paths.append(path)
+        paths = given
     return paths
 
 
@@ -172,7 +165,7 @@ def _uncross(groups: _Groups, paths: list[list[int]], clock: NDArray[np.float64]
     """Exchange the ends of two paths after they met, where both then bend less."""
     for a, b in combinations(range(len(paths)), 2):
         apart = np.linalg.norm(
-            _smooth(groups, paths[a], clock, WINDOW).centers - _smooth(groups, paths[b], clock, WINDOW).centers, axis=1
+            _smooth(groups, paths[a], clock).centers - _smooth(groups, paths[b], clock).centers, axis=1
         )
         lowest = [
             i
@@ -200,16 +193,14 @@ def _bend(groups: _Groups, before: list[int], after: list[int], moment: float) -
     return float(np.square(groups.centers[around] - fitted).sum())
 
 
-def _smooth(
-    groups: _Groups, path: list[int], clock: NDArray[np.float64], window: float, *, alone: bool = False
-) -> Trajectory:
+def _smooth(groups: _Groups, path: list[int], clock: NDArray[np.float64], *, alone: bool = False) -> Trajectory:
     """The path at every time (T,): a straight line fitted to the groups around it, by weights that fall off in time.
 
     alone: whether by those of other times alone."""
     centers = groups.centers[path]
     lapses = groups.clock[path] - clock[:, None]
     nearest = np.abs(lapses).min(axis=1)[:, None]
-    weights = np.exp(-0.5 * (lapses / (window + nearest)) ** 2)
+    weights = np.exp(-0.5 * (lapses / (WINDOW + nearest)) ** 2)
     if alone:
         weights *= lapses != 0
     result = np.zeros((len(clock), 3), np.float32)

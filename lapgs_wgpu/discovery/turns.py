@@ -87,7 +87,7 @@ def _united(tracks: Tracks) -> Tracks:
     """The tracks, with one number for parts whose centers stay within half a radius of each other."""
     numbers = np.arange(int(tracks.part.max()) + 1)
     centers = [tracks.paths[:, tracks.part == k].mean(axis=1) for k in numbers]
-    for a, b in combinations(numbers, 2):
+    for a, b in combinations(range(len(numbers)), 2):
         near = 0.5 * min(part_radius(tracks, a), part_radius(tracks, b))
         if np.median(np.linalg.norm(centers[a] - centers[b], axis=1)) < near:
             numbers[numbers == numbers[b]] = numbers[a]
@@ -136,6 +136,8 @@ def _cells(places: Doubles, size: float) -> tuple[NDArray[np.int64], int]:
 
 def _explained(places: Doubles, colors: Floats) -> float:
     """Share of the variance of colors (n, 3) that places (n, 3) of size CELL explain, as if they were independent."""
+    if len(colors) < 2:
+        return 0.0
     cells, _ = _cells(places, CELL)
     counts = np.bincount(cells)
     used = np.flatnonzero(counts)
