@@ -128,18 +128,16 @@ class _Body(NamedTuple):
 def _with_bodies(tracks: Tracks, bodies: list[_Body]) -> Tracks:
     """The tracks, with bodies in place of parts; their positions are those at the times where the parts were found."""
     others = ~np.isin(tracks.part, [body.part for body in bodies])
-    kept = tracks.paths[:, others], tracks.supported[:, others]
-    parts = [(tracks.positions[others], tracks.colors[others], tracks.part[others], *kept)]
+    over_time = tracks.paths[:, others], tracks.supported[:, others]
+    parts = [(tracks.positions[others], tracks.colors[others], tracks.part[others], *over_time)]
     for body in bodies:
         members = tracks.part == body.part
         away = np.linalg.norm(tracks.paths[:, members].mean(axis=1) - tracks.positions[members].mean(axis=0), axis=1)
-        number, supported = np.full(POINTS, body.part), np.repeat(tracks.supported[:, members][:, :1], POINTS, axis=1)
-        parts.append((body.paths[int(away.argmin())], body.colors, number, body.paths, supported))
-    positions, colors, part, paths, supported = zip(*parts, strict=True)
-    return Tracks(
-        np.concatenate(positions), np.concatenate(colors), np.concatenate(part), np.concatenate(paths, axis=1),
-        np.concatenate(supported, axis=1),
-    )  # fmt: skip
+        seen = np.repeat(tracks.supported[:, members][:, :1], POINTS, axis=1)
+        parts.append((body.paths[int(away.argmin())], body.colors, np.full(POINTS, body.part), body.paths, seen))
+    every = list(zip(*parts, strict=True))
+    positions, colors, part = (np.concatenate(values) for values in every[:3])
+    return Tracks(positions, colors, part, *(np.concatenate(values, axis=1) for values in every[3:]))
 
 
 def _shown(image: Residual, centers: NDArray[np.float32], radii: NDArray[np.float32]) -> list[NDArray[np.bool_]]:
