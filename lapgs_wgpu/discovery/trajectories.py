@@ -78,7 +78,7 @@ def find_trajectories(clouds: PointClouds, link: float, half_side: float) -> lis
         paths.append(path)
     at_once = int(np.quantile(np.bincount(groups.time, minlength=len(clock)), AT_ONCE))
     paths = _one_to_one(groups, paths[:at_once], clock, half_side) + paths[at_once:]
-    return [_smooth(groups, path, clock) for path in paths if path]
+    return [_smooth(groups, path, clock) for path in paths]
 
 
 def _groups(clouds: PointClouds, clock: NDArray[np.float64], link: float) -> _Groups:
@@ -157,7 +157,7 @@ def _one_to_one(
             for row, column in zip(*linear_sum_assignment(np.minimum(cost, 4.0)), strict=True):
                 if away[row, column] < 2:
                     given[row].append(int(here[column]))
-        paths = given
+        paths = [own if len(own) >= LEAST_WORTH else path for own, path in zip(given, paths, strict=True)]
     return paths
 
 
@@ -179,7 +179,7 @@ def _uncross(groups: _Groups, paths: list[list[int]], clock: NDArray[np.float64]
                 sum(_bend(groups, one, other, clock[i]) for one, other in zip(before, ends, strict=True))
                 for ends in (after, after[::-1])
             ]
-            if bends[1] < bends[0]:
+            if bends[1] < bends[0] and min(len(before[0] + after[1]), len(before[1] + after[0])) >= LEAST_WORTH:
                 paths[a], paths[b] = before[0] + after[1], before[1] + after[0]
 
 
@@ -199,10 +199,9 @@ def _smooth(groups: _Groups, path: list[int], clock: NDArray[np.float64], *, alo
     alone: whether by those of other times alone."""
     centers = groups.centers[path]
     lapses = groups.clock[path] - clock[:, None]
-    nearest = np.abs(lapses).min(axis=1)[:, None]
-    weights = np.exp(-0.5 * (lapses / (WINDOW + nearest)) ** 2)
-    if alone:
-        weights *= lapses != 0
+    counted = lapses != 0 if alone else np.full(lapses.shape, fill_value=True)
+    nearest = np.where(counted, np.abs(lapses), np.inf).min(axis=1)[:, None]
+    weights = counted * np.exp(-0.5 * (lapses / (WINDOW + nearest)) ** 2)
     result = np.zeros((len(clock), 3), np.float32)
     for i, (weight, lapse) in enumerate(zip(weights, lapses, strict=True)):
         basis = np.stack([np.ones_like(lapse), lapse], axis=1)
