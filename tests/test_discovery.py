@@ -460,7 +460,7 @@ def test_a_field_that_knows_the_tracks_learns_slowly_also_when_resumed(
 @pytest.mark.nightly
 def test_without_parts_to_follow_the_static_fit_starts_a_training(dataset: Dataset, device: Device) -> None:
     config = configure(discovery__least="1")
-    static, _, _ = static_fit(config, dataset, device, lambda step: None)
+    static, *_ = static_fit(config, dataset, device, lambda step: None)
     found = discover(config, dataset, device)
     assert "nothing is added" in found.summary
     assert found.scene.parameters["dynamics"].abs().sum() == 0
