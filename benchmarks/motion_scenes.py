@@ -10,20 +10,31 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lapgs_wgpu.data.raytrace import SAMPLES, Floats, Hits, Ints, Solid, Vector, pixel_rays, plane_hits, solid_hits
+from lapgs_wgpu.data.raytrace import (
+    SAMPLES,
+    Floats,
+    Hits,
+    Ints,
+    Solid,
+    Vector,
+    pixel_rays,
+    plane_hits,
+    solid_hits,
+    turn_about_z,
+)
 from lapgs_wgpu.data.synthetic import camera_at, jumps
 from lapgs_wgpu.io.dataclass_table import Options, option
 from lapgs_wgpu.splat.camera import Camera
 
 CameraMotion = Literal["jump", "walk", "still"]
 Backdrop = Literal["black", "white", "room"]
-ObjectSet = Literal["two", "enter", "occluded"]
+ObjectSet = Literal["two", "enter", "occluded", "twins", "rods"]
 
 FOV_X, ROOM_FOV_X = 0.69, 0.6  # horizontal field of view of all cameras, radians; in the room
 STILL_CAMERAS = 6  # that take the training images of camera="still"
@@ -34,6 +45,8 @@ ENTER_JUMP_HEIGHT = (0.3, 0.6)  # of objects="enter": the box comes from above, 
 WALK_HEIGHT, WALK_BOB = 0.47, 0.05  # mean and amplitude of a walk's
 FLOOR, WALL = -1.05, 1.3  # z of the room's floor; distance of its walls from the origin, and their height
 ENTER_HEIGHT, ENTER_TIMES = 2.3, (0.3, 0.5)  # the box drops into the scene from this much above its path
+TILT = 0.6  # radians; of the axis of what turns
+RODS = 1 / 4, 1 / 8  # thickness of the rods, diameters
 SHORTEST_OCCLUDED_PATH = 3  # leaves space for a column
 
 
@@ -54,12 +67,15 @@ class MotionScene(Options):
         "black",
     )
     objects: ObjectSet = option(
-        "two: two moving objects; enter: the box drops into the scene at t = 0.4; occluded: both circle a column", "two"
+        "two: two moving objects; enter: the box drops into the scene at t = 0.4; occluded: both circle a column; "
+        "twins: equal balls whose paths cross; rods: one of a quarter, one of an eighth of the ball's thickness",
+        "two",
     )
+    turns: float = option("of both objects about a tilted axis over the clip", 0.0, at_least=0, at_most=60)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("path", "cycles"):
+        for name in ("path", "cycles", "turns"):
             object.__setattr__(self, name, float(getattr(self, name)))  # 4 and 4.0 are written alike
         if self.objects == "occluded" and self.path < SHORTEST_OCCLUDED_PATH:
             raise ValueError(
@@ -73,7 +89,7 @@ class MovingObject:
     """A solid with center `centre + cosine cos(2 pi f t) + sine sin(2 pi f t)`, f = `cycles`, world units.
 
     diameter: of the ball, or of a ball with the volume of the box. drop: height from which it enters. A static object
-    has 0 cycles; no masks are written for it.
+    has 0 cycles; no masks are written for it. turns: over the clip, about an axis of its own.
     """
 
     name: str
@@ -84,6 +100,7 @@ class MovingObject:
     sine: Vector = (0.0, 0.0, 0.0)
     cycles: float = 0.0
     drop: float = 0.0
+    turns: float = 0.0
 
     @property
     def moves(self) -> bool:
@@ -103,6 +120,13 @@ class MovingObject:
         left = 1 - np.clip((time - start) / (end - start), 0, 1)
         return path + self.drop * left * left * (3 - 2 * left) * [0, 0, 1]
 
+    def turn(self, time: float) -> Floats:
+        """(3, 3) its rotation at a time."""
+        if not self.turns:
+            return np.eye(3)
+        c, s = math.cos(TILT), math.sin(TILT)
+        return np.array([[1, 0, 0], [0, c, -s], [0, s, c]]) @ turn_about_z(2 * math.pi * self.turns * time)
+
 
 def moving_objects(scene: MotionScene) -> tuple[MovingObject, ...]:
     """All objects of a scene, the moving ones first."""
@@ -119,6 +143,7 @@ def moving_objects(scene: MotionScene) -> tuple[MovingObject, ...]:
         cosine=(radius * math.cos(0.6), radius * math.sin(0.6), 0),
         sine=(-radius * math.sin(0.6), radius * math.cos(0.6), 0),
         cycles=scene.cycles,
+        turns=scene.turns,
     )
     occluded = scene.objects == "occluded"
     box = MovingObject(
@@ -130,6 +155,7 @@ def moving_objects(scene: MotionScene) -> tuple[MovingObject, ...]:
         sine=(radius, 0, 0) if occluded else (0, 0, 0),
         cycles=scene.cycles,
         drop=ENTER_HEIGHT if scene.objects == "enter" else 0.0,
+        turns=scene.turns,
     )
     still = MovingObject(
         "still",
@@ -137,6 +163,15 @@ def moving_objects(scene: MotionScene) -> tuple[MovingObject, ...]:
         0.4,
         (0.25, -0.2, FLOOR + 0.2),
     )
+    if scene.objects == "twins":  # both pass the middle at once, one above the other
+        ball = replace(ball, centre=(0, 0, -height), cosine=(radius, 0, 0), sine=(0, 0, 0))
+        return ball, replace(ball, name="twin", centre=(0, 0, height), cosine=(0, radius, 0)), still
+    if scene.objects == "rods":
+        thin, thinner = (
+            Solid("box", (0.75 * diameter, width * diameter / 2, width * diameter / 2), box.solid.colors)
+            for width in RODS
+        )
+        return replace(ball, name="thin", solid=thin), replace(box, name="thinner", solid=thinner), still
     if not occluded:
         return ball, box, still
     half = 0.85 * (radius - box.reach) / math.sqrt(2)  # within the circles of both
@@ -153,7 +188,7 @@ def trace(scene: MotionScene, camera: Camera, time: float) -> list[Hits]:
     for one in moving_objects(scene):
         centre = one.positions([time])[0]
         among = _rays_around(camera, centre, one.reach)
-        surfaces.append(solid_hits(one.solid, centre, eye, rays, among=among))
+        surfaces.append(solid_hits(one.solid, centre, eye, rays, turn=one.turn(time), among=among))
     if scene.background == "room":
         surfaces.append(plane_hits(2, FLOOR, 1, _floor, eye, rays))
         surfaces.append(plane_hits(0, -WALL, 1, _bricks, eye, rays))

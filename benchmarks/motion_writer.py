@@ -91,6 +91,7 @@ def write_motion(
             "shape": one.solid.shape,
             "half": one.solid.half,
             "diameter": one.diameter,
+            "turns": one.turns,
             "positions": {split: one.positions(times).tolist() for split, times in times_of.items()},
         }
         for one in moving_objects(scene)

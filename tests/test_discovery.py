@@ -8,12 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from motion_scenes import MotionScene
+from motion_scenes import MotionScene, moving_objects, scene_cameras, trace
 from motion_writer import write_motion
+from scipy.spatial.transform import Rotation
 
 from lapgs_wgpu.data import Dataset, load_dataset
+from lapgs_wgpu.data.raytrace import combine, pixel_means
 from lapgs_wgpu.data.synthetic import cameras
 from lapgs_wgpu.data.views import small_views
+from lapgs_wgpu.discovery import rigid_fit
 from lapgs_wgpu.discovery.acceptance import explained_share, rows_with, tracks_in_images
 from lapgs_wgpu.discovery.discover import RAMP_STEPS, discover
 from lapgs_wgpu.discovery.field_fit import fit_field
@@ -23,6 +26,7 @@ from lapgs_wgpu.discovery.static_fit import static_fit
 from lapgs_wgpu.discovery.surface_points import PointClouds, Points, surface_points
 from lapgs_wgpu.discovery.tracks import Tracks, find_tracks
 from lapgs_wgpu.discovery.trajectories import find_trajectories
+from lapgs_wgpu.discovery.turns import find_turns
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
@@ -208,6 +212,19 @@ def test_a_trajectory_does_not_change_over_to_another_color_at_a_crossing() -> N
         assert min(np.linalg.norm(each.centers - center, axis=1)[[0, 10, 50, 59]].max() for each in found) < RADIUS
 
 
+def test_equal_things_that_meet_keep_their_own_trajectories() -> None:
+    """Their points become one group, out of which each goes on as before."""
+    t = np.linspace(0, 1, 100)
+    swing = 0.7 * np.cos(4 * np.pi * t)
+    one, other = np.stack([swing, 0 * t, 0.23 + 0 * t], axis=1), np.stack([0 * t, swing, -0.23 + 0 * t], axis=1)
+    clouds = balls(one, other)
+    grey = tuple(cloud._replace(colors=0 * cloud.colors + 0.5) for cloud in clouds.clouds)
+    found = find_trajectories(PointClouds(clouds.times, grey), LINK, BOX)
+    assert len(found) == 2
+    for center in (one, other):
+        assert min(np.linalg.norm(each.centers - center, axis=1).max() for each in found) < 1.5 * RADIUS
+
+
 @pytest.mark.nightly
 def test_two_balls_are_followed_over_the_whole_clip() -> None:
     t = np.linspace(0, 1, 80)
@@ -228,6 +245,52 @@ def test_patches_that_come_and_go_are_not_followed() -> None:
     places = rng.uniform(-0.8, 0.8, (6, 3))
     leaping = places[rng.integers(0, 6, 80)]
     assert find_tracks(balls(leaping), BOX) is None
+
+
+# Turns ---------------------------------------------------------------------------------------------------------------
+
+
+def seen_turning(turns: float, size: int, count: int) -> tuple[Tracks, list[Residual], np.ndarray]:
+    """Tracks of a box's center that do not know its turns, the images of it, and its rotations (T, 3, 3)."""
+    scene = MotionScene(path=1, cycles=1, turns=turns)
+    box, times = moving_objects(scene)[1], np.linspace(0, 1, count)
+    black, images = np.zeros((size, size, 3), np.float32), []
+    for camera, t in zip(scene_cameras(scene, "train", times, 0, size=size), times, strict=True):
+        color, _ = combine([trace(scene, camera, float(t))[1]], 9 * size**2)
+        images.append(
+            Residual(camera, float(t), np.moveaxis(pixel_means(color, camera), 0, 2).astype(np.float32), black)
+        )
+    corners = np.random.default_rng(0).uniform(-1, 1, (40, 3)) * box.solid.half
+    paths = (box.positions(times)[:, None] + corners).astype(np.float32)
+    colors, part = np.full((40, 3), 0.5, np.float32), np.zeros(40, np.int64)
+    tracks = Tracks(paths[count // 2], colors, part, paths, np.ones(paths.shape[:2], bool))
+    return tracks, images, np.stack([box.turn(t) for t in times])
+
+
+def degrees_beside(R: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """(T,) angles between rotations (T, 3, 3), but for one that all of them have in common."""
+    left, _, right = np.linalg.svd((np.swapaxes(R, 1, 2) @ true).sum(axis=0))
+    return np.degrees(Rotation.from_matrix(R @ left @ right @ np.swapaxes(true, 1, 2)).magnitude())
+
+
+@pytest.mark.nightly
+def test_a_part_that_turns_becomes_a_rigid_body(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rigid_fit, "STEPS", 400)
+    tracks, images, true = seen_turning(0.8, 48, 40)
+    times = np.linspace(0, 1, 40)
+    united, found = find_turns(tracks, times, images)
+    assert degrees_beside(found[0], true).mean() < 15
+    rigid, bodies = rigid_fit.rigid_tracks(united, found, times, images, device, torch.Generator().manual_seed(0))
+    assert bodies == 1
+    arms = rigid.paths - rigid.paths.mean(axis=1, keepdims=True)
+    left, _, right = np.linalg.svd(np.einsum("tni,nj->tij", arms, arms[20]))
+    assert np.quantile(degrees_beside(left @ right, true), 0.9) < 6
+    assert np.ptp(np.linalg.norm(arms, axis=2), axis=0).max() < 1e-3  # it keeps its shape
+
+
+def test_a_part_that_does_not_turn_stays_as_it_is() -> None:
+    tracks, images, _ = seen_turning(0.0, 48, 40)
+    assert not find_turns(tracks, np.linspace(0, 1, 40), images)[1]
 
 
 # The static fit and what it loses ------------------------------------------------------------------------------------
@@ -397,7 +460,7 @@ def test_a_field_that_knows_the_tracks_learns_slowly_also_when_resumed(
 @pytest.mark.nightly
 def test_without_parts_to_follow_the_static_fit_starts_a_training(dataset: Dataset, device: Device) -> None:
     config = configure(discovery__least="1")
-    static, _, _ = static_fit(config, dataset, device, lambda step: None)
+    static, *_ = static_fit(config, dataset, device, lambda step: None)
     found = discover(config, dataset, device)
     assert "nothing is added" in found.summary
     assert found.scene.parameters["dynamics"].abs().sum() == 0

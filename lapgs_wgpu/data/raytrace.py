@@ -22,6 +22,7 @@ Vector = tuple[float, float, float]
 Color = tuple[float, float, float]
 
 SAMPLES = 3  # a pixel is the mean of SAMPLES x SAMPLES rays
+UPRIGHT = np.eye(3)  # no turn
 LIGHT = np.array([0.30, -0.35, 0.887])  # unit vector towards the light
 AMBIENT, SKY, DIFFUSE = 0.42, 0.13, 0.45  # sum to 1; SKY: how much more light comes from above than from the side
 
@@ -61,11 +62,11 @@ def pixel_rays(camera: Camera) -> Floats:
 
 
 def solid_hits(
-    solid: Solid, centre: Floats, eye: Floats, rays: Floats, *, angle: float = 0.0, among: Ints | None = None
+    solid: Solid, centre: Floats, eye: Floats, rays: Floats, *, turn: Floats = UPRIGHT, among: Ints | None = None
 ) -> Hits:
     """Where rays (3, N) from `eye` first meet a solid.
 
-    angle: by which it is turned about z, radians. among: indices of the rays that can meet it; None for all.
+    turn: (3, 3) rotation of the solid about its centre. among: indices of the rays that can meet it; None for all.
     """
     half = np.array(solid.half)
     if among is not None:
@@ -74,7 +75,7 @@ def solid_hits(
     along = -dot(rays, to_eye)
     beside = dot(to_eye, to_eye) - along**2  # squared distance at which a ray passes the centre
     near = np.flatnonzero(beside < (half @ half if solid.shape == "box" else half[0] ** 2))
-    origin, d = _turned(to_eye, -angle), _turned(rays[:, near], -angle)
+    origin, d = _turned(to_eye, turn.T), _turned(rays[:, near], turn.T)
     if solid.shape == "box":
         with np.errstate(divide="ignore", invalid="ignore"):
             entry = ((-np.sign(d) * half[:, None] - origin[:, None]) / d).max(axis=0)
@@ -96,7 +97,7 @@ def solid_hits(
         else:
             pattern = np.floor(p[2] * 2 + 0.5) % 2 == 0
     one, other = np.array(solid.colors)[:, :, None]
-    color = _lit(np.where(pattern, one, other), _turned(normal, angle))
+    color = _lit(np.where(pattern, one, other), _turned(normal, turn))
     return Hits(near if among is None else among[near], distance, color)
 
 
@@ -156,10 +157,15 @@ def dot(a: Floats, b: Floats) -> Floats:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _turned(p: Floats, angle: float) -> Floats:
-    """Vectors (3, ...) rotated about z."""
+def turn_about_z(angle: float) -> Floats:
+    """(3, 3) rotation by an angle, radians."""
     c, s = math.cos(angle), math.sin(angle)
-    return np.stack([c * p[0] - s * p[1], s * p[0] + c * p[1], p[2]])
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
+
+def _turned(p: Floats, turn: Floats) -> Floats:
+    """Vectors (3, ...), rotated."""
+    return np.stack([row[0] * p[0] + row[1] * p[1] + row[2] * p[2] for row in turn])
 
 
 def _lit(albedo: Floats, normal: Floats) -> Floats:

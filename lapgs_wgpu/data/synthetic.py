@@ -27,6 +27,7 @@ from lapgs_wgpu.data.raytrace import (
     plane_hits,
     solid_hits,
     to_pixels,
+    turn_about_z,
 )
 from lapgs_wgpu.splat.camera import Camera
 
@@ -87,8 +88,8 @@ def render(camera: Camera, time: float, toys: Sequence[Toy] = TOYS) -> NDArray[n
     rays = pixel_rays(camera)
     surfaces = []
     for toy in toys:
-        angle = 2 * np.pi * toy.cycles * time if toy.turns else 0.0
-        surfaces.append(solid_hits(toy.solid, toy.path([time])[0], camera.position, rays, angle=angle))
+        turn = turn_about_z(2 * np.pi * toy.cycles * time if toy.turns else 0.0)
+        surfaces.append(solid_hits(toy.solid, toy.path([time])[0], camera.position, rays, turn=turn))
     surfaces.append(plane_hits(2, TABLE_HEIGHT, 1, _table, camera.position, rays))
     color, owner = combine(surfaces, rays.shape[1])
     return to_pixels(color, owner >= 0, camera)

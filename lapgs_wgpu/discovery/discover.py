@@ -12,9 +12,11 @@ from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.discovery.acceptance import explained_share, rows_with, tracks_in_images
 from lapgs_wgpu.discovery.cutouts import cutout_tracks
 from lapgs_wgpu.discovery.field_fit import fit_field
+from lapgs_wgpu.discovery.rigid_fit import rigid_tracks
 from lapgs_wgpu.discovery.static_fit import static_fit
 from lapgs_wgpu.discovery.surface_points import surface_points
 from lapgs_wgpu.discovery.tracks import Tracks, find_tracks
+from lapgs_wgpu.discovery.turns import find_turns
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import Scene4D
@@ -75,6 +77,12 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
     if share < config.discovery.least:
         tracks = None
     generator = torch.Generator().manual_seed(config.seed)
+    bodies = 0
+    if tracks is not None and not sheets:
+        united, turns = find_turns(tracks, times, images)
+        if turns:
+            turned, bodies = rigid_tracks(united, turns, times, images, device, generator)
+            tracks = turned if bodies else tracks
     scene = scene_with(static, tracks, config, device, generator, own_field, sheets=sheets)
     found = f"{share:.1%} of what it lacks can be followed: nothing is added"
     if tracks is not None:
@@ -88,6 +96,8 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
             f"{len(np.unique(tracks.part))} moving parts with {len(tracks.part)} Gaussians, {share:.0%} of what it "
             f"lacks, followed within {error:.3f} world units"
         )
+        if bodies:
+            found += f", {bodies} of them as rigid bodies"
     order = morton_order(scene.parameters["means"].detach())
     for name, values in scene.parameters.items():
         scene.parameters[name] = torch.nn.Parameter(values.detach()[order])

@@ -4,14 +4,20 @@ The points of a time form groups. Dynamic programming links the groups of all ti
 them and bends least; the groups on it are then worth less, and the next path is looked for. A path may leap over times
 at which nothing is seen, and may turn sharply a few times. What follows parts step by step (`tracks`) takes the
 trajectories as a second opinion, since it goes astray where things are fast, hidden, or turn sharply.
+
+Paths that were found one after another share groups, and change over where things meet. So as many paths as there
+usually are groups are given the groups of each time at once, one to one, and paths that meet part in the way in which
+they bend least.
 """
 
 from __future__ import annotations
 
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 
 from lapgs_wgpu.data.timestamps import time_step
 from lapgs_wgpu.discovery.residual import Floats
@@ -25,11 +31,15 @@ AGAIN = 0.1  # worth of a group that is on an earlier path
 LEAST_WORTH = 8.0  # of a path
 MOST = 8  # paths
 COLOR_SPREAD = 0.15
+AT_ONCE = 0.75  # quantile, over the times, of the number of groups: so many paths are given groups one to one
 SHARP = 2.0  # highest cost of a bend, and of a change of color
 WINDOW = 1.0  # time steps; standard deviation of the weights by which a path is smoothed
 # In half sides of the box:
 BEND = 0.3  # standard deviation of a group's center around the straight continuation of its path
 STEP = 0.7  # from one time to the next, at most
+REACHES = 0.5, 0.25, 0.12  # within twice this a path may be given a group, in rounds
+MEETING = 0.6  # paths that meet come so near
+MEET_TIMES, MEET_GAP = 6, 2  # time steps before and after a meeting that tell who is who; those around it that do not
 
 
 class Trajectory(NamedTuple):
@@ -59,14 +69,16 @@ def find_trajectories(clouds: PointClouds, link: float, half_side: float) -> lis
     """
     clock = clouds.times / time_step(clouds.times)
     groups = _groups(clouds, clock, link)
-    trajectories: list[Trajectory] = []
-    while len(trajectories) < MOST:
+    paths: list[list[int]] = []
+    while len(paths) < MOST:
         path, worth = _best_path(groups, len(clouds.times), half_side)
         if worth < LEAST_WORTH:
             break
         groups.worth[path] *= AGAIN
-        trajectories.append(_smooth(groups, path, clock))
-    return trajectories
+        paths.append(path)
+    at_once = int(np.quantile(np.bincount(groups.time, minlength=len(clock)), AT_ONCE))
+    paths = _one_to_one(groups, paths[:at_once], clock, half_side) + paths[at_once:]
+    return [_smooth(groups, path, clock) for path in paths]
 
 
 def _groups(clouds: PointClouds, clock: NDArray[np.float64], link: float) -> _Groups:
@@ -126,12 +138,70 @@ def _best_path(groups: _Groups, times: int, half_side: float) -> tuple[list[int]
     return path[::-1], total
 
 
-def _smooth(groups: _Groups, path: list[int], clock: NDArray[np.float64]) -> Trajectory:
-    """The path at every time (T,): a straight line fitted to the groups around it, by weights that fall off in time."""
+def _one_to_one(
+    groups: _Groups, paths: list[list[int]], clock: NDArray[np.float64], half_side: float
+) -> list[list[int]]:
+    """The paths, to which the groups of each time are given all at once, each to one (the Hungarian method)."""
+    if len(paths) < 2:
+        return paths
+    for reach in REACHES:
+        _uncross(groups, paths, clock, half_side)
+        centers = np.stack([_smooth(groups, path, clock, alone=True).centers for path in paths])
+        colors = np.stack([np.median(groups.colors[path], axis=0) for path in paths])
+        given: list[list[int]] = [[] for _ in paths]
+        for i in range(len(clock)):
+            here = np.flatnonzero(groups.time == i)
+            away = np.linalg.norm(centers[:, i, None] - groups.centers[here], axis=2) / (reach * half_side)
+            change = ((colors[:, None] - groups.colors[here]) ** 2).sum(axis=2) / (2 * COLOR_SPREAD**2)
+            cost = away**2 + 0.5 * np.minimum(SHARP, change)
+            for row, column in zip(*linear_sum_assignment(np.minimum(cost, 4.0)), strict=True):
+                if away[row, column] < 2:
+                    given[row].append(int(here[column]))
+        paths = [own if len(own) >= LEAST_WORTH else path for own, path in zip(given, paths, strict=True)]
+    return paths
+
+
+def _uncross(groups: _Groups, paths: list[list[int]], clock: NDArray[np.float64], half_side: float) -> None:
+    """Exchange the ends of two paths after they met, where both then bend less."""
+    for a, b in combinations(range(len(paths)), 2):
+        apart = np.linalg.norm(
+            _smooth(groups, paths[a], clock).centers - _smooth(groups, paths[b], clock).centers, axis=1
+        )
+        lowest = [
+            i
+            for i in range(1, len(clock) - 1)
+            if apart[i] < MEETING * half_side and apart[i] == apart[max(0, i - MEET_TIMES) : i + MEET_TIMES + 1].min()
+        ]
+        for i in lowest:
+            before = [[g for g in paths[n] if groups.time[g] <= i] for n in (a, b)]
+            after = [[g for g in paths[n] if groups.time[g] > i] for n in (a, b)]
+            bends = [
+                sum(_bend(groups, one, other, clock[i]) for one, other in zip(before, ends, strict=True))
+                for ends in (after, after[::-1])
+            ]
+            if bends[1] < bends[0] and min(len(before[0] + after[1]), len(before[1] + after[0])) >= LEAST_WORTH:
+                paths[a], paths[b] = before[0] + after[1], before[1] + after[0]
+
+
+def _bend(groups: _Groups, before: list[int], after: list[int], moment: float) -> float:
+    """Squared distances from a parabola of the groups of a path shortly before and after a moment."""
+    around = [g for g in before + after if MEET_GAP < abs(groups.clock[g] - moment) <= MEET_GAP + MEET_TIMES]
+    if len(around) < 6:
+        return 0.0
+    basis = np.vander((groups.clock[around] - moment) / MEET_TIMES, 3)
+    fitted = basis @ np.linalg.lstsq(basis, groups.centers[around], rcond=None)[0]
+    return float(np.square(groups.centers[around] - fitted).sum())
+
+
+def _smooth(groups: _Groups, path: list[int], clock: NDArray[np.float64], *, alone: bool = False) -> Trajectory:
+    """The path at every time (T,): a straight line fitted to the groups around it, by weights that fall off in time.
+
+    alone: whether by those of other times alone."""
     centers = groups.centers[path]
     lapses = groups.clock[path] - clock[:, None]
-    nearest = np.abs(lapses).min(axis=1)[:, None]
-    weights = np.exp(-0.5 * (lapses / (WINDOW + nearest)) ** 2)
+    counted = lapses != 0 if alone else np.full(lapses.shape, fill_value=True)
+    nearest = np.where(counted, np.abs(lapses), np.inf).min(axis=1)[:, None]
+    weights = counted * np.exp(-0.5 * (lapses / (WINDOW + nearest)) ** 2)
     result = np.zeros((len(clock), 3), np.float32)
     for i, (weight, lapse) in enumerate(zip(weights, lapses, strict=True)):
         basis = np.stack([np.ones_like(lapse), lapse], axis=1)

@@ -1,0 +1,165 @@
+"""Parts that turn as rigid bodies: their shape and colors, and their turn and shift at each time, fitted by drawing.
+
+A body starts as a ball of Gaussians that turns as `turns` found. Steps of Adam on one image after another fit its
+Gaussians, the light, and smooth corrections of its turn and shift at all times.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lapgs_wgpu.discovery.residual import Residual
+from lapgs_wgpu.discovery.tracks import Tracks
+from lapgs_wgpu.discovery.turns import harmonics, part_radius
+from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.splat.rasterize import rasterize
+
+POINTS = 300  # of a body
+SPACING = 0.5  # standard deviation of a Gaussian in distances of a body's points, at first
+OPACITY = 1.5  # logit, at first
+STEPS = 600  # twice as many wander off where things turn by 15 degrees and more from one time to the next
+SHAPE_FIRST = 120  # steps before bodies are turned and shifted
+RATES = {"points": 2e-3, "colors": 2e-2, "sizes": 1e-2, "opacities": 3e-2, "light": 5e-3, "turns": 5e-3, "shifts": 1e-3}
+LAST = 0.05  # of these rates, in the end; they fall over the second half
+UNEXPLAINED = 0.3  # of what the static fit lacks where a body is: more is left over of what is not rigid
+SMOOTHING = 1.5  # times; standard deviation of the weights that make a turn and a shift of those around
+
+
+def rigid_tracks(
+    tracks: Tracks,
+    rotations: Mapping[int, NDArray[np.float64]],
+    times: NDArray[np.float64],
+    images: Sequence[Residual],
+    device: Device,
+    generator: torch.Generator,
+) -> tuple[Tracks, int]:
+    """The tracks, in which the parts of the given rotations (T, 3, 3) at the times (T,) are rigid bodies, and how many.
+
+    Other parts are drawn, too, as they are, and so stay those of which too little of the images is explained.
+    """
+    parts = list(rotations)
+    radii = torch.tensor([part_radius(tracks, k) for k in parts])
+    others = ~np.isin(tracks.part, parts)
+    R0 = torch.from_numpy(np.stack([rotations[k] for k in parts], axis=1)).float()
+    centers = torch.from_numpy(np.stack([tracks.paths[:, tracks.part == k].mean(axis=1) for k in parts], axis=1))
+    soft_paths, soft_colors = torch.from_numpy(tracks.paths[:, others]), torch.from_numpy(tracks.colors[others])
+    count = len(parts) * POINTS
+    points = _sphere(POINTS) * radii[:, None, None]
+    size = torch.log(SPACING * (4 * np.pi / POINTS) ** 0.5 * radii)[:, None].repeat(1, POINTS).ravel()
+    soft_size = torch.full((int(others.sum()),), float(size.mean()))
+    clock = torch.arange(len(times))
+    near = torch.exp(-0.5 * ((clock[:, None] - clock) / SMOOTHING) ** 2)
+    near = near / near.sum(dim=1, keepdim=True)
+    values = {
+        "points": points,
+        "colors": torch.cat([torch.full((count, 3), 0.4), soft_colors]),
+        "sizes": torch.cat([size, soft_size]),
+        "opacities": torch.full((count + len(soft_size),), OPACITY),
+        "light": torch.eye(9)[0].repeat(len(parts), 1),
+        "turns": torch.zeros(len(times), len(parts), 3),
+        "shifts": torch.zeros(len(times), len(parts), 3),
+    }
+    for value in values.values():
+        value.requires_grad_()
+    optimizer = torch.optim.Adam([{"params": [value], "name": name} for name, value in values.items()])
+
+    def poses(at: int | slice) -> tuple[Tensor, Tensor]:
+        turns, shifts = (torch.tensordot(near[at], values[name], 1) for name in ("turns", "shifts"))
+        return torch.linalg.matrix_exp(_cross(turns)) @ R0[at], centers[at] + shifts
+
+    order: list[int] = []
+    errors = np.zeros((2, len(parts)))  # of the static fit and of the drawing, where a part is, at the end
+    for step in range(STEPS):
+        order = order or torch.randperm(len(images), generator=generator).tolist()
+        image = images[order.pop()]
+        at = int(np.searchsorted(times, image.time))
+        for group in optimizer.param_groups:
+            moves = group["name"] in ("turns", "shifts")
+            rate = RATES[group["name"]] * max(LAST, min(1.0, 2.0 * (STEPS - step) / STEPS))
+            group["lr"] = 0.0 if moves and step < SHAPE_FIRST else rate
+        R, center = poses(at)
+        arms = values["points"] @ R.transpose(1, 2)
+        x, y, z = torch.nn.functional.normalize(arms.detach(), dim=2).unbind(dim=2)
+        lit = (torch.stack(harmonics(x, y, z), dim=2) @ values["light"][:, :, None]).reshape(-1, 1)
+        means = torch.cat([(arms + center[:, None]).reshape(-1, 3), soft_paths[at]])
+        drawn = rasterize(
+            means,
+            torch.tensor([1.0, 0, 0, 0]).repeat(len(means), 1),
+            values["sizes"].exp()[:, None].repeat(1, 3),
+            values["opacities"].sigmoid(),
+            values["colors"] * torch.cat([lit, torch.ones(len(soft_size), 1)]),
+            image.camera,
+            antialiased=True,
+            depth=False,
+            device=device,
+        )
+        picture = drawn.image + (1 - drawn.alpha)[..., None] * torch.from_numpy(image.still)
+        difference = (picture - torch.from_numpy(image.image)).abs()
+        optimizer.zero_grad()
+        difference.sum().backward()
+        optimizer.step()
+        if step >= STEPS - len(images):
+            absolute = np.abs(image.still - image.image), difference.numpy(force=True)
+            for n, where in enumerate(_shown(image, center.numpy(force=True), radii.numpy())):
+                errors[:, n] += [each[where].sum() for each in absolute]
+    rigid = errors[1] < UNEXPLAINED * errors[0]
+    with torch.no_grad():
+        R, center = poses(slice(None))
+        paths = (values["points"] @ R.transpose(2, 3) + center[:, :, None]).numpy()
+        colors = values["colors"][:count].clamp(0, 1).reshape(len(parts), POINTS, 3).numpy()
+    bodies = [_Body(k, paths[:, n], colors[n]) for n, k in enumerate(parts) if rigid[n]]
+    return _with_bodies(tracks, bodies), len(bodies)
+
+
+class _Body(NamedTuple):
+    """part: whose place it takes. paths: (T, POINTS, 3). colors: (POINTS, 3)."""
+
+    part: int
+    paths: NDArray[np.float32]
+    colors: NDArray[np.float32]
+
+
+def _with_bodies(tracks: Tracks, bodies: list[_Body]) -> Tracks:
+    """The tracks, with bodies in place of parts; their positions are those at the times where the parts were found."""
+    others = ~np.isin(tracks.part, [body.part for body in bodies])
+    over_time = tracks.paths[:, others], tracks.supported[:, others]
+    parts = [(tracks.positions[others], tracks.colors[others], tracks.part[others], *over_time)]
+    for body in bodies:
+        members = tracks.part == body.part
+        away = np.linalg.norm(tracks.paths[:, members].mean(axis=1) - tracks.positions[members].mean(axis=0), axis=1)
+        seen = np.repeat(tracks.supported[:, members][:, :1], POINTS, axis=1)
+        parts.append((body.paths[int(away.argmin())], body.colors, np.full(POINTS, body.part), body.paths, seen))
+    every = list(zip(*parts, strict=True))
+    positions, colors, part = (np.concatenate(values) for values in every[:3])
+    return Tracks(positions, colors, part, *(np.concatenate(values, axis=1) for values in every[3:]))
+
+
+def _shown(image: Residual, centers: NDArray[np.float32], radii: NDArray[np.float32]) -> list[NDArray[np.bool_]]:
+    """For each ball (n, 3) of these radii (n,) the moving pixels (H, W) within its outline."""
+    middles, depths = image.camera.project(centers.astype(np.float64))
+    rows, columns = np.indices(image.mask.shape) + 0.5
+    return [
+        image.mask & (np.hypot(columns - x, rows - y) < image.camera.K[0, 0] * radius / depth)
+        for (x, y), depth, radius in zip(middles, np.maximum(depths, 1e-6), radii, strict=True)
+    ]
+
+
+def _sphere(count: int) -> Tensor:
+    """(count, 3) points spread over the unit sphere, along a spiral."""
+    height = 1 - (2 * np.arange(count) + 1) / count
+    angle = np.pi * (1 + 5**0.5) * np.arange(count)
+    wide = np.sqrt(1 - height**2)
+    return torch.from_numpy(np.stack([wide * np.cos(angle), wide * np.sin(angle), height], axis=1)).float()
+
+
+def _cross(vectors: Tensor) -> Tensor:
+    """(..., 3, 3) matrices of the cross product with vectors (..., 3)."""
+    x, y, z = vectors.unbind(dim=-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))

@@ -1,0 +1,215 @@
+"""How parts turn, as far as their colors tell when they are laid on a ball around each part's center.
+
+Where a part turns as assumed, images of different times agree on the color of each place of the ball. A search finds
+the turn from one time to the next on which those around a key time agree best. From there outwards, each time turns as
+its image fits best what is known of the ball, near the turn that goes on as before. `rigid_fit` makes it exact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+from scipy.spatial.transform import Rotation
+
+from lapgs_wgpu.data.evenly import evenly_indices
+from lapgs_wgpu.discovery.residual import Floats, Residual
+from lapgs_wgpu.discovery.tracks import Tracks
+
+Doubles = NDArray[np.float64]
+
+PIXELS = 2000  # of an image, at most
+SAMPLES = 150  # of a part in an image, at most
+LEAST_SAMPLES = 10
+ROUND = 0.9  # quantile of the distances of a part's points from its center that is the radius of the ball
+RIM = 0.9  # radii of the ball; beyond, pixels are mixed with what lies behind
+OVERLAP = 1.2  # radii of another part, within which pixels may show that one
+DARK = 0.2  # least light, of the mean brightness
+KEYS = 3  # times around which the turn is looked for
+REACH = 3, 5  # times on either side, in the rough search and in the finer ones
+FASTEST = 36.0  # degrees from one time to the next
+STEPS = 8.0, 4.0, 2.0  # degrees, of the rough search and the finer ones
+BEST = 12, 4  # turns of a search that the next one looks around
+CELL, FINE = 0.25, 0.12  # radii; size of the places at which colors are compared, in the search and from there on
+BLUR = 2.0  # FINE; standard deviation of the weights by which the colors around a place tell its color
+AROUND = (6.0, 2), (2.0, 2), (1.0, 1)  # degrees of a step and number of steps, of the search for the turn of a time
+AS_BEFORE = 18.0  # degrees beside the turn that goes on as before, that weigh as much as all differences of color
+MEMORY = 4  # times by which a turn goes on
+GAIN = 0.15  # share of the colors' variance that the turns of a part must explain, beyond what they do without turns
+
+
+class _Look(NamedTuple):
+    """What the images of a time show of a part: unit vectors (n, 3) from its center, and colors (n, 3)."""
+
+    places: Doubles
+    colors: Floats
+
+
+def harmonics(x: Any, y: Any, z: Any) -> list[Any]:
+    """The 9 functions of unit vectors that make the light on a matt surface (Ramamoorthi and Hanrahan 2001)."""
+    return [0 * x + 1, x, y, z, x * y, y * z, z * x, x * x - y * y, 3 * z * z - 1]
+
+
+def part_radius(tracks: Tracks, k: int) -> float:
+    """Radius of the ball around part k."""
+    paths = tracks.paths[:, tracks.part == k]
+    return float(np.quantile(np.linalg.norm(paths - paths.mean(axis=1, keepdims=True), axis=2), ROUND))
+
+
+def find_turns(tracks: Tracks, times: Doubles, images: Sequence[Residual]) -> tuple[Tracks, dict[int, Doubles]]:
+    """The tracks, of whose parts those that are at one place are united, and by the number of each part that turns its
+    rotations (T, 3, 3) at the times (T,), from whatever orientation."""
+    tracks = _united(tracks)
+    parts = range(int(tracks.part.max()) + 1)
+    centers = np.stack([tracks.paths[:, tracks.part == k].mean(axis=1) for k in parts], axis=1)
+    radii = np.array([part_radius(tracks, k) for k in parts])
+    found = {}
+    for k in parts:
+        looks = _looks(k, times, centers, radii, images)
+        if sum(len(look.places) > 0 for look in looks) < 2 * max(REACH) + 1:
+            continue
+        R = _turns(looks)
+        colors = np.concatenate([look.colors for look in looks])
+        turned, still = (
+            _explained(np.concatenate([look.places @ each for look, each in zip(looks, S, strict=True)]), colors)
+            for S in (R, [np.eye(3)] * len(R))
+        )
+        if turned - still >= GAIN:
+            found[k] = R
+    return tracks, found
+
+
+def _united(tracks: Tracks) -> Tracks:
+    """The tracks, with one number for parts whose centers stay within half a radius of each other."""
+    numbers = np.arange(int(tracks.part.max()) + 1)
+    centers = [tracks.paths[:, tracks.part == k].mean(axis=1) for k in numbers]
+    for a, b in combinations(range(len(numbers)), 2):
+        near = 0.5 * min(part_radius(tracks, a), part_radius(tracks, b))
+        if np.median(np.linalg.norm(centers[a] - centers[b], axis=1)) < near:
+            numbers[numbers == numbers[b]] = numbers[a]
+    return tracks._replace(part=np.unique(numbers, return_inverse=True)[1].ravel()[tracks.part])
+
+
+def _looks(k: int, times: Doubles, centers: Floats, radii: Doubles, images: Sequence[Residual]) -> list[_Look]:
+    """What each of the times (T,) shows of part k. centers: (T, p, 3) and radii: (p,) of all parts."""
+    found: list[list[_Look]] = [[_Look(np.zeros((0, 3)), np.zeros((0, 3), np.float32))] for _ in times]
+    others = np.arange(len(radii)) != k
+    for image in images:
+        at = int(np.searchsorted(times, image.time))
+        rays, to = image.rays(PIXELS), centers[at] - image.camera.position
+        d = rays.directions / np.linalg.norm(rays.directions, axis=1, keepdims=True)
+        along = d @ to.T
+        beside = (to**2).sum(axis=1) - along**2  # (n, p) squared distances of rays and centers
+        hidden = (beside[:, others] < (OVERLAP * radii[others]) ** 2).any(axis=1)
+        chosen = np.flatnonzero((beside[:, k] < (RIM * radii[k]) ** 2) & ~hidden)
+        if len(chosen) < LEAST_SAMPLES:
+            continue
+        chosen = chosen[evenly_indices(len(chosen), SAMPLES)]
+        distances = along[chosen, k] - np.sqrt(radii[k] ** 2 - np.maximum(beside[chosen, k], 0.0))
+        found[at].append(_Look((distances[:, None] * d[chosen] - to[k]) / radii[k], rays.colors[chosen]))
+    return _unlit([_Look(*map(np.concatenate, zip(*each, strict=True))) for each in found])
+
+
+def _unlit(looks: list[_Look]) -> list[_Look]:
+    """The colors without the light, which does not turn with a part."""
+    basis = np.stack(harmonics(*np.concatenate([look.places for look in looks]).T), axis=1)
+    bright = np.concatenate([look.colors for look in looks]).mean(axis=1)
+    H = basis.T @ basis
+    light = np.linalg.solve(H + 1e-3 * (np.trace(H) + 1) / 9 * np.eye(9), basis.T @ bright)
+    least = DARK * float(bright.mean()) if len(bright) else 1.0
+    return [
+        look._replace(colors=look.colors / np.maximum(np.stack(harmonics(*look.places.T), 1) @ light, least)[:, None])
+        for look in looks
+    ]
+
+
+def _cells(places: Doubles, size: float) -> tuple[NDArray[np.int64], int]:
+    """(...) numbers of the cells of a cubic grid in which places (..., 3) lie, and how many it has along an axis."""
+    side = int(2 / size) + 3
+    index = np.floor(places / size).astype(np.int64) + side // 2
+    return (index[..., 0] * side + index[..., 1]) * side + index[..., 2], side
+
+
+def _explained(places: Doubles, colors: Floats) -> float:
+    """Share of the variance of colors (n, 3) that places (n, 3) of size CELL explain, as if they were independent."""
+    if len(colors) < 2:
+        return 0.0
+    cells, _ = _cells(places, CELL)
+    counts = np.bincount(cells)
+    used = np.flatnonzero(counts)
+    rest = float(np.square(colors).sum())
+    for values in colors.T:
+        rest -= float((np.bincount(cells, values)[used] ** 2 / counts[used]).sum())
+    return 1.0 - rest / max(len(cells) - len(used), 1) / max(float(colors.var(axis=0).sum()), 1e-9)
+
+
+def _turn_at(looks: list[_Look], key: int) -> tuple[Doubles, float]:
+    """The turn (3,) from one time to the next around a key time, a rotation vector, and how much more of the colors it
+    explains than no turn."""
+
+    def explained(turns: Doubles, reach: int) -> Doubles:
+        around = range(max(0, key - reach), min(len(looks), key + reach + 1))
+        colors = np.concatenate([looks[i].colors for i in around])
+        rotations = [(looks[i].places, Rotation.from_rotvec((i - key) * turns).as_matrix()) for i in around]
+        return np.array(
+            [_explained(np.concatenate([places @ R[n] for places, R in rotations]), colors) for n in range(len(turns))]
+        )
+
+    turns = STEPS[0] * _grid(int(FASTEST / STEPS[0]))
+    turns = np.radians(turns[np.linalg.norm(turns, axis=1) <= FASTEST])
+    values = explained(turns, REACH[0])
+    for step, best in zip(STEPS[1:], BEST, strict=True):
+        around = turns[np.argsort(-values, kind="stable")[:best], None] + np.radians(step) * _grid(1)
+        turns = np.unique(around.reshape(-1, 3).round(9), axis=0)
+        values = explained(turns, REACH[1])
+    top = int(values.argmax())
+    return turns[top], float(values[top] - explained(np.zeros((1, 3)), REACH[1])[0])
+
+
+def _grid(half: int) -> Doubles:
+    """(n, 3) whole numbers from -half to half."""
+    axis = np.arange(-half, half + 1.0)
+    return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _turns(looks: list[_Look]) -> Doubles:
+    """(T, 3, 3) rotations of a part, from the key time at which a turn explains most."""
+    reach, count = REACH[1], len(looks)
+    keys = np.unique(np.linspace(reach, count - 1 - reach, KEYS).round().astype(int))
+    found = [_turn_at(looks, int(key)) for key in keys]
+    best = int(np.argmax([gain for _, gain in found]))
+    key, turn = int(keys[best]), found[best][0]
+    R = Rotation.from_rotvec((np.arange(count) - key)[:, None] * turn).as_matrix()
+    sums = np.zeros((4, *[_cells(np.zeros(3), FINE)[1]] * 3))  # of the cells: number of samples, and their colors
+    for i in sorted(range(count), key=lambda i: (abs(i - key), i)):
+        if abs(i - key) > reach:
+            last = i - np.sign(i - key) * np.arange(1, MEMORY + 2)
+            steps = Rotation.from_matrix(R[last[:-1]] @ np.swapaxes(R[last[1:]], 1, 2)).as_rotvec()
+            R[i] = _turn_of(looks[i], Rotation.from_rotvec(steps.mean(axis=0)).as_matrix() @ R[last[0]], sums)
+        cells, _ = _cells(looks[i].places @ R[i], FINE)
+        for each, values in zip(sums, [None, *looks[i].colors.T], strict=True):
+            each += np.bincount(cells, values, each.size).reshape(each.shape)
+    return R
+
+
+def _turn_of(look: _Look, expected: Doubles, sums: Doubles) -> Doubles:
+    """The rotation (3, 3) near the expected one by which a time fits best what earlier ones show."""
+    if not len(look.places):
+        return expected
+    total, mean = sums[0].sum(), sums[1:].sum(axis=(1, 2, 3)) / sums[0].sum()
+    count, *blurred = (gaussian_filter(each, BLUR, mode="constant", truncate=2.5).ravel() for each in sums)
+    unknown = 1e-5 * total
+    known = ((np.array(blurred) + unknown * mean[:, None]) / (count + unknown)).T
+    variance = max(float(look.colors.var(axis=0).sum()), 1e-6)
+    best = expected
+    for step, half in AROUND:
+        R = Rotation.from_rotvec(np.radians(step) * _grid(half)).as_matrix() @ best
+        cells, _ = _cells(np.einsum("nj,hjk->hnk", look.places, R), FINE)
+        errors = np.square(known[cells] - look.colors).sum(axis=2).mean(axis=1) / variance
+        away = np.degrees(Rotation.from_matrix(R @ expected.T).magnitude())
+        best = R[int((errors + (away / AS_BEFORE) ** 2).argmin())]
+    return best
