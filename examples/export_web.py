@@ -19,7 +19,7 @@ parser.add_argument("--out", type=Path, default=Path("scene.html"))
 def main() -> None:
     given = parser.parse_args()
     scene = load_scene(given.checkpoint, open_device)
-    export_compact(scene, given.out, overwrite=True)
+    export_compact(scene, given.out)
     print(f"{given.out}: {scene.playback.count} Gaussians, {given.out.stat().st_size / 1e6:.2f} MB")
 
 

@@ -45,7 +45,7 @@ def export_scene(scene: Scene4D, folder: Path, device: Device, name: str = "scen
     scene.save(checkpoint, {"view": LOOK.to_json(), "background": "grey"})
     loaded = load_scene(checkpoint, lambda: device)
     for ending in (".lapgs", ".html"):
-        export_compact(loaded, folder / f"{name}{ending}", overwrite=True)
+        export_compact(loaded, folder / f"{name}{ending}")
     return folder / f"{name}.html"
 
 
