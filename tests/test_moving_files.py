@@ -1,4 +1,4 @@
-"""Moving scenes in files of other programs: what was written is read back, by a foreign reader where there is one."""
+"""Moving scenes in files of other programs are written and read back, by a foreign reader where there is one."""
 
 from __future__ import annotations
 

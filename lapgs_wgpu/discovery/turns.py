@@ -1,4 +1,4 @@
-"""How parts turn, as far as their colors tell when they are laid on a ball around each part's center.
+"""Rotations of moving parts, estimated from their colors on a ball around each part's center.
 
 Where a part turns as assumed, images of different times agree on the color of each place of the ball. A search finds
 the turn from one time to the next on which those around a key time agree best. From there outwards, each time turns as

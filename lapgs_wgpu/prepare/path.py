@@ -1,4 +1,4 @@
-"""What a hand-held camera does not do, by which cameras that were placed wrongly are told."""
+"""Signs of wrongly placed cameras: motion that no hand-held camera makes."""
 
 from __future__ import annotations
 
