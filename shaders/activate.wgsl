@@ -6,7 +6,6 @@
 @group(0) @binding(5) var<storage, read_write> quats: array<vec4<f32>>;
 @group(0) @binding(6) var<storage, read_write> scales: array<f32>;
 @group(0) @binding(7) var<storage, read_write> opacities: array<f32>;
-@group(0) @binding(8) var<storage, read_write> dead: atomic<u32>;   // scales at the floor, counted
 #ifdef MOVING
 @group(0) @binding(3) var<storage, read> outputs: array<f32>;       // (N, outputs), without their biases
 #import common/activate_outputs
@@ -41,9 +40,4 @@ fn main(
 #end
     quats[i] = quat;
     opacities[i] = 1.0 / (1.0 + exp(-logit));
-    let least = scale <= vec3(MIN_SCALE);
-    let count = u32(least.x) + u32(least.y) + u32(least.z);
-    if (count > 0u) {
-        atomicAdd(&dead, count);
-    }
 }

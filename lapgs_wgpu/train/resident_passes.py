@@ -75,7 +75,7 @@ class ResidentPasses:
         return self._pool.array("statistics", (len(self._scene), 2))
 
     def word(self, name: str) -> DeviceArray:
-        """A word that passes share: guard, bad or dead."""
+        """A word that passes share: guard or bad."""
         return self._pool.array(name, (1,), "uint32")
 
     def record(self, commands: Commands, task: Task, truth: DeviceArray, *, judged: bool) -> Recorded:
@@ -90,7 +90,6 @@ class ResidentPasses:
     def at(self, t: float, degree: int) -> Gaussians[DeviceArray]:
         """The Gaussians at a time of the field, in arrays that the next step overwrites. degree: of the harmonics."""
         with Commands(self._device) as commands:
-            commands.clear(self.word("dead"))
             field, values = self._field, self.parameters.arrays("value")
             decoding = None if field is None else field.decode(commands, 0, values, lambda: t)
             return self._activate(commands, degree, decoding)
@@ -102,7 +101,6 @@ class ResidentPasses:
         self._checked = True
         camera = task.view.camera
         with Commands(self._device) as commands:
-            commands.clear(self.word("dead"))
             drawn = self._activate(commands, task.sh_degree, None)
         d_image = self._losses.pool.array("d_image", (4, camera.height, camera.width))
         while self.rasterizer.grow_on_overflow(drawing := self.rasterizer.draw(drawn, camera, gradient=True)):
@@ -132,9 +130,9 @@ class ResidentPasses:
         return step
 
     def _record(self, commands: Commands, task: Task, truth: DeviceArray, *, judged: bool) -> Recorded:
-        guard, bad, dead = (self.word(name) for name in ("guard", "bad", "dead"))
+        guard, bad = self.word("guard"), self.word("bad")
         totals = self._pool.array("totals", (len(TOTALS),))
-        for array in (bad, dead, totals):
+        for array in (bad, totals):
             commands.clear(array)
         decodings = self._decode(commands, task)
         drawn = self._activate(commands, task.sh_degree, decodings[0] if decodings else None)
@@ -147,7 +145,7 @@ class ResidentPasses:
         corrections.sum_camera(commands, by_drawn.camera)
         self._record_bwd(commands, drawn, by_drawn, decodings, totals)
         self._record_end(commands, task, drawing, by_drawn, terms, judged=judged)
-        return Recorded(drawing, [guard, bad, dead, terms, totals, *drawing.needed])
+        return Recorded(drawing, [guard, bad, terms, totals, *drawing.needed])
 
     def _decode(self, commands: Commands, task: Task) -> tuple[Decoding, Comparison | None, Line | None] | None:
         """Record the field; what varies from step to step is asked for anew."""
@@ -170,8 +168,7 @@ class ResidentPasses:
 
     def _activate(self, commands: Commands, degree: int, decoding: Decoding | None) -> Gaussians[DeviceArray]:
         geometry, sh = (self.parameters.blocks[name].arrays["value"] for name in ("geometry", "sh"))
-        dead, antialiased = self.word("dead"), self._scene.antialiased
-        return self._activation.activate(commands, geometry, sh, degree, decoding, dead, antialiased=antialiased)
+        return self._activation.activate(commands, geometry, sh, degree, decoding, antialiased=self._scene.antialiased)
 
     def _record_bwd(
         self,

@@ -65,12 +65,11 @@ class Flying:
 
 
 class _Told(NamedTuple):
-    """What a step tells. guard: 0, or the step at which it was closed; bad: why; dead: number of scales at the floor;
-    terms, totals: of the losses of the image, and of motion; needed: of each band's intersections."""
+    """What a step tells. guard: 0, or the step at which it was closed; bad: why; terms, totals: of the
+    losses of the image, and of motion; needed: of each band's intersections."""
 
     guard: int
     bad: int
-    dead: int
     terms: NDArray[np.float32]
     totals: NDArray[np.float32]
     needed: list[NDArray[np.uint32]]
@@ -105,7 +104,6 @@ class ResidentStep:
         self.settled = 0
         self.broken: Callable[[int | None], None] = lambda step: None
         self.tell: Callable[[Measured], None] = lambda measured: None
-        self.dead_scales = 0.0
         scene.on_access, scene.on_device = self.to_host, self.at
         learners.optimizer.on_access = self.to_rest
         learners.on_access = self.corrections_to_host
@@ -224,7 +222,6 @@ class ResidentStep:
         if not told.guard:
             self._passes.rasterizer.grow_on_overflow(first.drawing, told.needed)
             self._flying.popleft()
-            self.dead_scales = told.dead / max(1, 3 * self.count)
             self._tell(first, told, "")
             return
         behind = self._ground()
@@ -271,8 +268,8 @@ class ResidentStep:
             self._flying.append(self._submit(each))
 
     def _told(self, flying: Flying) -> _Told:
-        guard, bad, dead, terms, totals, *needed = flying.later.read()
-        return _Told(int(guard[0]), int(bad[0]), int(dead[0]), terms, totals, needed)
+        guard, bad, terms, totals, *needed = flying.later.read()
+        return _Told(int(guard[0]), int(bad[0]), terms, totals, needed)
 
     def _terms(self, task: Task, told: _Told) -> dict[str, float]:
         weights, values = self._passes.weights(task), told.terms.tolist()

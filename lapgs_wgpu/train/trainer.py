@@ -163,7 +163,8 @@ class Trainer:
         """Where the steps are computed, and why, in words."""
         if self._resident is not None:
             return "resident: on the device from end to end"
-        reason = why_exchange(self.config, self.parts) or "the device is a CPU"
+        chosen = "the device is a CPU" if self.scene.device.is_cpu else "step_place says so"
+        reason = why_exchange(self.config, self.parts) or chosen
         return f"exchange: by torch, since {reason}"
 
     def close(self) -> None:

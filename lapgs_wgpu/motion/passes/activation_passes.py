@@ -51,19 +51,18 @@ class ActivationPasses:
         sh: DeviceArray,
         degree: int,
         decoding: Decoding | None,
-        dead: DeviceArray,
         *,
         antialiased: bool,
     ) -> Gaussians[DeviceArray]:
         """Record the activation of Gaussians; without a decoding they stand still.
 
-        degree: of the harmonics that are drawn. dead: (1,) uint32, zero before: how many scales are at the floor.
+        degree: of the harmonics that are drawn.
         """
         n, floats = geometry.shape[0], 3 * (degree + 1) ** 2
         shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
         drawn = {name: self.pool.array(name, shape) for name, shape in shapes.items()}
         colors = self.pool.array("sh", (n, floats // 3, 3))
-        arrays = drawn | self._moving(decoding) | {"geometry": geometry, "dead": dead, "sh": sh, "colors": colors}
+        arrays = drawn | self._moving(decoding) | {"geometry": geometry, "sh": sh, "colors": colors}
         self._dispatch(commands, "activate", n, floats, decoding, arrays)
         self._dispatch(commands, "activate_sh", n, floats, decoding, arrays)
         return Gaussians(**drawn, sh=colors, antialiased=antialiased)
