@@ -43,6 +43,7 @@ PATCH = 12  # pixels of a window at about one depth: fewer are chance
 EDGE = 0.05  # difference of two colors across which depths hardly spread
 HELD = 1e3  # weight of believed depths, relative to those of their neighbors
 MOVED = 0.08  # difference of a color from the median from which on something moves there
+MOMENTS = (0.1, 0.3, 0.5, 0.7, 0.9)  # shares of the clip at which a rig's surfaces that move are searched for
 FLAT = 1e-8  # product of two variances, below which windows are flat and look like nothing
 
 
@@ -80,17 +81,23 @@ def still_surface(dataset: Dataset) -> Surface | None:
     points, colors = _kept(found)
     text = f"start: {len(points)} points on surfaces, {share:.0%} of the pixels of {len(stills)} cameras"
     if dataset.is_rig:
-        middle = _stills(dataset, at=float(np.median(dataset.times)))
-        changes = [np.abs(now.colors - still.colors).mean(axis=2) for now, still in zip(middle, stills, strict=True)]
-        moved = [_box(change).ravel() > MOVED for change in changes]
-        if any(mask.any() for mask in moved):
-            found = _surfaces(middle, dataset.depths)
-            found = [(*each[:2], each[2] & mask) for each, mask in zip(found, moved, strict=True)]
-            points_moved, colors_moved = _kept(found)
-            points, colors = np.concatenate([points, points_moved]), np.concatenate([colors, colors_moved])
-            text += f", and {len(points_moved)} on what moves, at the clip's middle"
+        moved = [_moved(dataset, stills, float(time)) for time in np.quantile(dataset.times, MOMENTS)]
+        points, colors = (np.concatenate([own, *each]) for own, each in zip((points, colors), zip(*moved), strict=True))
+        if count := sum(len(each[0]) for each in moved):
+            text += f", and {count} on what moves, at {len(MOMENTS)} times"
     say(text)
     return Surface(points, colors, share) if share else None
+
+
+def _moved(dataset: Dataset, stills: list[_Still], time: float) -> tuple[Points, Points]:
+    """Points and colors (N, 3) of the surfaces that differ at a time from what stands still."""
+    now = _stills(dataset, at=time)
+    changes = [np.abs(one.colors - still.colors).mean(axis=2) for one, still in zip(now, stills, strict=True)]
+    moved = [_box(change).ravel() > MOVED for change in changes]
+    if not any(mask.any() for mask in moved):
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
+    found = _surfaces(now, dataset.depths)
+    return _kept([(*each[:2], each[2] & mask) for each, mask in zip(found, moved, strict=True)])
 
 
 def _kept(found: list[tuple[Points, Points, Mask]]) -> tuple[Points, Points]:
