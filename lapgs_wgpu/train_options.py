@@ -29,8 +29,8 @@ Train a 4D Gaussian splatting model of a moving scene on a folder of images, on 
   lapgs-train dnerf --data DIR --out RUN        D-NeRF scene as in the paper (800x800 pixels)
   lapgs-train hypernerf --data DIR              Nerfies or HyperNeRF capture; for a CPU: hypernerf-tiny
   lapgs-train neu3d --data DIR                  several static cameras; for a CPU: neu3d-tiny
-  lapgs-train rig --data DIR                    calibrated cameras around what moves, for a CPU
-  lapgs-train film --data DIR                   your own film and its masks/, converted by lapgs-prepare
+  lapgs-train rig-full --data DIR               calibrated cameras around what moves; for a CPU: rig
+  lapgs-train film-full --data DIR              your own film and its masks/ (lapgs-prepare); for a CPU: film
   lapgs-train RUN/config.toml --out RUN2        repeat a run
   lapgs-train --resume RUN                      continue an interrupted training
   lapgs-train --eval RUN                        evaluate RUN/checkpoint.ply on the test views again

@@ -23,7 +23,7 @@ from lapgs_wgpu.train.trainer import Trainer
 FILM, MASKS = "a film with masks of what moves", "masks"  # the latter is lapgs-prepare's folder of them
 # By the arrangement of the cameras: the large preset, and the small one.
 PRESETS = {
-    FILM: ("film", "film"),
+    FILM: ("film-full", "film"),
     "one moving camera": ("hypernerf", "hypernerf-tiny"),
     "static cameras": ("neu3d", "neu3d-tiny"),
     "cameras all around": ("dnerf", "tiny"),
