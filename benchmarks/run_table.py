@@ -20,6 +20,7 @@ from statistics import mean, stdev
 from typing import Any
 
 from lapgs_wgpu.command import DEVICE_HELP, guarded
+from lapgs_wgpu.data.built_in import SYNTHETIC
 from lapgs_wgpu.errors import DeviceError, InputError, NumericalError, shown
 from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.atomic import atomic_write
@@ -28,7 +29,7 @@ from lapgs_wgpu.io.safe_json_toml import read_json, read_toml
 from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.lpips import Lpips
-from lapgs_wgpu.train.open_dataset import SYNTHETIC, open_dataset, resolve_data
+from lapgs_wgpu.train.open_dataset import open_dataset, resolve_data
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run_folder import has_state
 

@@ -11,9 +11,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from synthetic import write_synthetic
 
 from lapgs_wgpu import cli, command
-from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import NoAdapterError, quoted
 from lapgs_wgpu.gpu import device as device_module
 
@@ -131,15 +131,9 @@ def test_evaluation_refuses_what_it_has_no_use_for(
     assert (run / "metrics.json").read_bytes() == before
 
 
-def test_the_built_in_scene_is_written_beside_the_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from lapgs_wgpu.train import open_dataset
-
-    monkeypatch.setattr(
-        open_dataset, "write_synthetic", lambda folder: write_synthetic(folder, size=16, train_views=2, test_views=1)
-    )
-    assert cli.train_command(["tiny", "--data", "synthetic", "--out", str(tmp_path / "run"), *FAST]) == 0
+def test_the_built_in_scene_is_written_beside_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["tiny", "--data", "synthetic", "--out", str(tmp_path / "run"), *FAST, "--data.size", "16"]
+    assert cli.train_command(command) == 0
     assert (tmp_path / "synthetic" / "transforms_train.json").exists()
     assert f'path = "{tmp_path / "synthetic"}"' in (tmp_path / "run" / "config.toml").read_text()
     assert cli.train_command(["--eval", str(tmp_path / "run")]) == 0

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import synthetic as toys
 from helpers.captures import write_points
 from numpy.typing import NDArray
 from PIL import Image
 
 from lapgs_wgpu import cli
 from lapgs_wgpu.data import Dataset, load_dataset
-from lapgs_wgpu.data import synthetic as toys
 from lapgs_wgpu.data.cloud import views_of
 from lapgs_wgpu.data.normalize import cube_in_view
 from lapgs_wgpu.errors import InputError

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 import run_table
+from synthetic import write_synthetic
 
 from lapgs_wgpu import command
 from lapgs_wgpu.data import Dataset
-from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.presets import load_config, write_toml
 from lapgs_wgpu.train.run_folder import STATE

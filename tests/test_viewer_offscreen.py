@@ -11,9 +11,9 @@ import torch
 from helpers.ply_files import FIELDS, read_ply
 from helpers.scene_files import moving_scene
 from PIL import Image
+from synthetic import write_synthetic
 
 from lapgs_wgpu.data import load_dataset
-from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.gpu import device as device_module
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig

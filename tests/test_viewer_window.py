@@ -17,9 +17,9 @@ from helpers.desktop import Desktop
 from helpers.scene_files import CONFIG
 from helpers.waiting import PATIENCE
 from numpy.typing import NDArray
+from synthetic import write_synthetic
 
 from lapgs_wgpu.data import Dataset, load_dataset
-from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.scene import Scene4D, load
