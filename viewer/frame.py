@@ -60,10 +60,6 @@ class FrameRenderer:
         self._pool = BufferPool(playback.device)
         self._values: dict[Mode, tuple[DeviceArray, float]] = {}
 
-    def forget(self) -> None:
-        """Drop what was measured of the scene, because it has changed."""
-        self._values.clear()
-
     def modes(self) -> list[Mode]:
         """List the modes in which this scene has something to show."""
         missing = set() if self.playback.moves else {"motion"}

@@ -57,7 +57,7 @@ PASSES: dict[str, tuple[str, Defines]] = {
 }  # fmt: skip
 _FIELD = ("hashgrid_slice", "hashgrid SLICED", "hashgrid")  # beside one of deform
 _CHOSEN = ("color", "rasterize", "deform")  # one of each
-_DESKTOP_ACTIONS = ("next_mode", "next_view", "toggle_pause", "step_training")
+_DESKTOP_ACTIONS = ("next_mode", "next_view")
 
 
 def player_data() -> dict[str, Any]:
@@ -142,7 +142,7 @@ def page_html(scene: bytes, title: str, poster: NDArray[np.uint8], *, narrowest:
 
 
 def page_keys() -> list[KeyBinding]:
-    """The keys of lapgs-view that a page has a use for: it shows no capture and no training."""
+    """The keys of lapgs-view that a page has a use for: it shows no capture."""
     return [key for key in KEYS if key.action not in _DESKTOP_ACTIONS]
 
 
