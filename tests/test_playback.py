@@ -129,7 +129,7 @@ from lapgs_wgpu.motion.playback.playback import playback_of
 from lapgs_wgpu.motion.scene_file import read_scene
 
 playback = playback_of(read_scene(sys.argv[1]), open_device())
-playback.at(0.3), playback.means(0.5), playback.dynamics(), playback.snapshot(0.2)
+playback.at(0.3), playback.means(0.5), playback.snapshot(0.2)
 print("torch" in sys.modules)
 """
 

@@ -93,7 +93,7 @@ def test_time_background_and_size_of_a_view(run: Path, scene: Scene4D, tmp_path:
 
 
 @kernels
-@pytest.mark.parametrize("mode", ["depth", "alpha", "motion", "dynamics"])
+@pytest.mark.parametrize("mode", ["depth", "alpha", "motion"])
 def test_every_mode_gives_a_picture(mode: str, run: Path, tmp_path: Path) -> None:
     view(run / "checkpoint.ply", "--screenshot", tmp_path / "a.png", "--mode", mode, "--size", "40x30")
     got = picture(tmp_path / "a.png")

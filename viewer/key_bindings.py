@@ -26,7 +26,7 @@ KEYS = (
     KeyBinding("[", "[", "slower", "play slower"),
     KeyBinding("]", "]", "faster", "play faster"),
     KeyBinding("l", "L", "next_loop", "at the end: loop, bounce or stop"),
-    KeyBinding("m", "M", "next_mode", "what is shown: colors, depth, coverage, motion, dynamics"),
+    KeyBinding("m", "M", "next_mode", "what is shown: colors, depth, coverage, motion"),
     KeyBinding("b", "B", "next_background", "background: black, white or grey"),
     KeyBinding("x", "X", "antialiased", "antialiased or not (Mip-Splatting's filter)"),
     KeyBinding("f", "F", "focus", "turn about what lies under the pointer (a double click does the same)"),

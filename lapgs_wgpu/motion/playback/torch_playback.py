@@ -37,9 +37,5 @@ class TorchPlayback:
         with torch.no_grad():
             return np.array(self.scene.at(t).means.numpy(force=True))
 
-    def dynamics(self) -> NDArray[np.float32] | None:
-        d = self.scene.parameters.get("dynamics")
-        return None if d is None else np.array(d.numpy(force=True))
-
     def snapshot(self, t: float) -> GaussianSnapshot:
         return self.scene.snapshot(t)
