@@ -31,7 +31,6 @@ KEYS = (
     KeyBinding("x", "X", "antialiased", "antialiased or not (Mip-Splatting's filter)"),
     KeyBinding("f", "F", "focus", "turn about what lies under the pointer (a double click does the same)"),
     KeyBinding("r", "R", "reset_camera", "camera back to where it started"),
-    KeyBinding("v", "V", "flying", "fly: W A S D move, Q E down and up, Shift fast, Alt slow"),
     KeyBinding("n", "N", "next_view", "stand at the capture's next camera, at its time"),
     KeyBinding("o", "O", "show_overlay", "frames a second, milliseconds, splats, adapter"),
     KeyBinding("t", "T", "show_transport", "the time slider"),
@@ -44,5 +43,3 @@ MOUSE = (
     ("wheel", "nearer or farther"),
     ("double click", "turn about what lies there"),
 )
-# Direction of a flight: right, down, ahead.
-FLY = {"w": (0, 0, 1), "s": (0, 0, -1), "a": (-1, 0, 0), "d": (1, 0, 0), "q": (0, 1, 0), "e": (0, -1, 0)}

@@ -107,8 +107,6 @@ class Panels:
         if _button("Help"):
             state.show_help = not state.show_help
         _tip("keys and mouse (?)")
-        if state.flying:
-            imgui.text_colored(_ACCENT, "flying: W A S D Q E, V ends")
         if state.views:
             chosen = _choice("camera", state.view, range(len(state.views)), [view.name for view in state.views])
             if chosen is not None and chosen != state.view:

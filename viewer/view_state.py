@@ -26,7 +26,6 @@ class ViewState:
         self.mode: Mode = "rgb"
         self.show_panels = self.show_overlay = True
         self.show_help = False
-        self.flying = False
         self.scene, self.renderer = scene, FrameRenderer(scene.playback)
         self.camera, self.clock = scene.camera(), scene.clock()
         self.background = scene.background
