@@ -259,16 +259,13 @@ def test_mistakes_end_in_one_sentence(
     assert [file.name for file in tmp_path.iterdir()] == ["used"]
 
 
-@pytest.mark.parametrize(("line", "expected"), [("undistort = false", False), ("", True)])
-def test_the_capture_opens_as_the_training_opened_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str, expected: bool
-) -> None:
+def test_the_capture_opens_as_the_training_opened_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[dict[str, object]] = []
     monkeypatch.setattr(
         "lapgs_wgpu.data.load_dataset",
         lambda path, **given: opened.append(given) or SimpleNamespace(test=("a",), train=("b",)),
     )
-    (tmp_path / "config.toml").write_text(f'[data]\npath = "{tmp_path}"\nsize = 200\n{line}\n')
+    (tmp_path / "config.toml").write_text(f'[data]\npath = "{tmp_path}"\nsize = 200\n')
     scene = SimpleNamespace(path=tmp_path / "checkpoint.ply", playback=SimpleNamespace(metadata={}))
     assert capture_views(scene) == ("a", "b")  # type: ignore[arg-type]
-    assert opened == [{"image_size": 200, "normalize": True, "undistort": expected}]
+    assert opened == [{"image_size": 200, "normalize": True}]

@@ -28,7 +28,6 @@ def capture_views(scene: LoadedScene) -> tuple[View, ...]:
             Path(data["path"]),
             image_size=int(data["size"]) or None,
             normalize=not metadata or "placement" in metadata,
-            undistort=bool(data.get("undistort", True)),
         )
     except (OSError, ValueError, KeyError, TypeError, OverflowError):  # InputError is a ValueError
         return ()

@@ -39,7 +39,6 @@ def load_dataset(
     *,
     image_size: int | None = None,
     normalize: bool = True,
-    undistort: bool = True,
     masks: str | Path | None = None,
     movers: str | Path | None = None,
 ) -> Dataset:
@@ -49,8 +48,6 @@ def load_dataset(
         folder: of the capture.
         image_size: longer side in pixels, 1 or more, to which larger images are shrunk; None keeps their size.
         normalize: False keeps the coordinates of a D-NeRF scene of any size; other formats are always normalized.
-        undistort: False takes images as they are, and cameras as pinholes that look at the center of the image,
-            whatever the files say of distortion, skew and principal point, as published code on HyperNeRF does.
         masks: folder with a PNG for each training image, under its name, white where the training loss ignores it.
         movers: the same for each image, white where something moves; a name is one in the capture's folder.
 
@@ -65,10 +62,7 @@ def load_dataset(
         raise InputError(f"image_size must be at least 1 pixel, got {image_size}.")
     reader = _reader(folder)
     capture = reader.read(folder, image_size)
-    frames = list(capture.frames)
-    if not undistort:
-        frames = [dataclasses.replace(frame, lens=frame.lens.idealized) for frame in frames]
-    frames, warnings = upright(frames)
+    frames, warnings = upright(capture.frames)
     warnings = [*capture.warnings, *warnings, *check_plausible(frames)]
     frames, time_source = _timed(folder, dataclasses.replace(capture, frames=frames), warnings)
     check_frames(frames)
@@ -118,7 +112,6 @@ def load_dataset(
         cloud=placement.cloud,
         depths=placement.depths,
         normalization=whole,
-        scale=1.0 if fit is None else fit.scale,
         warnings=tuple(warnings),
         time_source=time_source,
         own_footage=capture.own_footage,

@@ -31,7 +31,6 @@ def open_dataset(config: Config, *, normalize: bool = True) -> Dataset:
         data.path,
         image_size=data.size or None,
         normalize=normalize,
-        undistort=data.undistort,
         masks=data.masks or None,
         movers=data.movers or None,
     )
