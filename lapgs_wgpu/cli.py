@@ -95,7 +95,7 @@ def _evaluate(run: Path, options: dict[str, typing.Any], overrides: dict[str, ty
     config = _config_of(run, overrides, "--eval needs the folder of a finished run")
     device = open_device(options["device"])
     scene = load(run / "checkpoint.ply", device)
-    config, dataset = _open_data(config, run.parent, normalize="placement" in scene.metadata)
+    config, dataset = _open_data(config, run.parent)
     if "data.path" in overrides:
         check_same_data(run, config.data.path, dataset)
     if movers is not None:  # the world's coordinates follow the masks of the run
@@ -146,13 +146,12 @@ def _config_of(run: Path, overrides: dict[str, typing.Any], advice: str) -> Conf
     return config
 
 
-def _open_data(config: Config, parent: Path, *, normalize: bool = True) -> tuple[Config, Dataset]:
-    """The dataset, and the configuration with its folder. parent: folder for the built-in scene. normalize: of
-    `load_dataset`."""
+def _open_data(config: Config, parent: Path) -> tuple[Config, Dataset]:
+    """The dataset, and the configuration with its folder. parent: folder for the built-in scene."""
     from lapgs_wgpu.train.open_dataset import open_dataset, resolve_data
 
     config = resolve_data(config, parent)
-    return config, open_dataset(config, normalize=normalize)
+    return config, open_dataset(config)
 
 
 if __name__ == "__main__":

@@ -265,7 +265,7 @@ def test_the_capture_opens_as_the_training_opened_it(tmp_path: Path, monkeypatch
         "lapgs_wgpu.data.load_dataset",
         lambda path, **given: opened.append(given) or SimpleNamespace(test=("a",), train=("b",)),
     )
-    (tmp_path / "config.toml").write_text(f'[data]\npath = "{tmp_path}"\nsize = 200\n')
+    (tmp_path / "config.toml").write_text(f'[data]\npath = "{tmp_path}"\nsize = 200\nmovers = "masks"\n')
     scene = SimpleNamespace(path=tmp_path / "checkpoint.ply", playback=SimpleNamespace(metadata={}))
     assert capture_views(scene) == ("a", "b")  # type: ignore[arg-type]
-    assert opened == [{"image_size": 200, "normalize": True}]
+    assert opened == [{"image_size": 200, "movers": "masks"}]

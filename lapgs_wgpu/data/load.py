@@ -38,7 +38,6 @@ def load_dataset(
     folder: str | Path,
     *,
     image_size: int | None = None,
-    normalize: bool = True,
     masks: str | Path | None = None,
     movers: str | Path | None = None,
 ) -> Dataset:
@@ -47,7 +46,6 @@ def load_dataset(
     Args:
         folder: of the capture.
         image_size: longer side in pixels, 1 or more, to which larger images are shrunk; None keeps their size.
-        normalize: False keeps the coordinates of a D-NeRF scene of any size; other formats are always normalized.
         masks: folder with a PNG for each training image, under its name, white where the training loss ignores it.
         movers: the same for each image, white where something moves; a name is one in the capture's folder.
 
@@ -84,7 +82,7 @@ def load_dataset(
         seen = [(c, _view(frame, 0, c, undistortions[frame.lens]).moving) for c, frame in by_time]
         moving = mover_cube(capture.cloud, [(camera, mask) for camera, mask in seen if mask is not None])
     trained = [frame for _, frame in training]
-    placement = place(capture, trained, training_cameras, normalize=normalize, moving=moving)
+    placement = place(capture, trained, training_cameras, moving=moving)
     warnings += placement.warnings
     summary = _summary(reader.name, capture, cameras, time_source)
 

@@ -24,13 +24,12 @@ def resolve_data(config: Config, scenes: Path) -> Config:
     return dataclasses.replace(config, data=dataclasses.replace(config.data, path=str(folder.resolve()), masks=masks))
 
 
-def open_dataset(config: Config, *, normalize: bool = True) -> Dataset:
-    """The dataset of a configuration whose path is a folder's. normalize: of `load_dataset`. Raises InputError."""
+def open_dataset(config: Config) -> Dataset:
+    """The dataset of a configuration whose path is a folder's. Raises InputError."""
     data = config.data
     return load_dataset(
         data.path,
         image_size=data.size or None,
-        normalize=normalize,
         masks=data.masks or None,
         movers=data.movers or None,
     )
