@@ -124,7 +124,7 @@ def test_ms_ssim_written_out(size: tuple[int, int]) -> None:
     assert MS_SSIM_SMALLEST == 161
 
 
-def test_what_moves_is_measured_by_itself(scene: Scene4D, tmp_path: Path) -> None:
+def test_what_moves_is_measured_by_itself_and_drawn_from_beside(scene: Scene4D, tmp_path: Path) -> None:
     drawn = to_8_bit(scene.render(CAMERA, 0.5).image)
     moving = np.zeros((16, 24), bool)
     moving[4:12, 6:18] = True
@@ -139,6 +139,8 @@ def test_what_moves_is_measured_by_itself(scene: Scene4D, tmp_path: Path) -> Non
     assert metrics["psnr_moving"] == pytest.approx(-20 * np.log10(128 / 255), abs=1e-3)
     assert metrics["ssim_moving"] < metrics["ssim_still"]
     assert metrics["explained"] < 0.2
+    with Image.open(tmp_path / "off_lost.png") as picture:
+        assert not np.array_equal(*np.split(np.asarray(picture), 2, axis=1))
     write_metrics(tmp_path, metrics)
     last = result_text(tmp_path).splitlines()
     assert last[0].startswith("warning: ")

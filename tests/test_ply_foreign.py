@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.motion.scene import load
+from lapgs_wgpu.motion.scene_file import read_scene
 from lapgs_wgpu.viewer.export import export_still
 from lapgs_wgpu.viewer.loaded_scene import load_scene
 from lapgs_wgpu.viewer.options import parse_options
@@ -100,6 +102,25 @@ def test_a_folder_of_stills(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(b"")
     with pytest.raises(InputError, match=r"2 \.ply files; give one of them, such as frame_0\.ply"):
         read_ply(tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["double", "text"])
+def test_doubles_far_from_the_origin(tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str) -> None:
+    offset = np.array([448262.0, 5411932.0, 120.0])
+    means = random_still(N, 0).means.astype(float) + offset
+    columns = columns_of(random_still(N, 0)) | {name: ("double", means[:, i]) for i, name in enumerate("xyz")}
+    file = tmp_path / "a.ply"
+    data = ply_bytes(columns)
+    if kind == "text":
+        rows = "".join(" ".join(repr(float(v[row])) for _, v in columns.values()) + "\n" for row in range(N))
+        head = data.partition(b"end_header\n")[0].replace(b"binary_little_endian", b"ascii")
+        data = head + b"end_header\n" + rows.encode()
+    file.write_bytes(data)
+    scene = read_scene(file)
+    taken = np.array(json.loads(scene.metadata["offset"]))
+    np.testing.assert_allclose(scene.gaussians["means"] + taken, means, rtol=0, atol=1e-6)
+    assert np.abs(scene.gaussians["means"]).max() < 10
+    assert "448262" in capsys.readouterr().err
 
 
 def test_an_antialiased_still_is_drawn_as_its_checkpoint(tmp_path: Path, device: Device) -> None:

@@ -109,7 +109,7 @@ def guess_view(playback: Playback, axis: str | None = None) -> InitialView:
     flat = extent[2] < _FLAT * min(extent[0], extent[1])
     if axis in AHEAD:
         up, ahead = direction(axis), direction(AHEAD[axis])
-    elif playback.metadata.keys() - {"antialiased", "up", "fps"}:  # of a checkpoint
+    elif playback.metadata.keys() - {"antialiased", "up", "offset", "fps"}:  # of a checkpoint
         up, ahead = direction("z"), direction("y")
     elif flat:
         up, ahead = direction("z"), direction("-y")  # y points down in pictures

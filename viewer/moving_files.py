@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import struct
 import sys
 from collections.abc import Callable
@@ -22,7 +23,7 @@ from lapgs_wgpu.io.ply_elements import open_ply
 from lapgs_wgpu.io.safe_json_toml import parse_json, read_json
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.playback.playback import activate
-from lapgs_wgpu.motion.scene_file import read_scene
+from lapgs_wgpu.motion.scene_file import SceneFile, read_scene
 from lapgs_wgpu.motion.timing import EVEN
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.constants import CONSTANTS
@@ -103,6 +104,7 @@ def read_frames(files: list[Path], metadata: dict[str, str]) -> MovingFile:
         with open_ply(file) as ply:
             counts.append(vertex_of(ply).count)
     first = read_scene(files[0])
+    start = _offset(first)
 
     @lru_cache(maxsize=4)
     def frame(number: int) -> Gaussians[Floats]:
@@ -112,10 +114,15 @@ def read_frames(files: list[Path], metadata: dict[str, str]) -> MovingFile:
         rows = np.where(present, np.arange(max(counts)), 0)
         names = ("means", "quats", "scales", "opacities", "colors")
         means, quats, scales, opacities, colors = (now[name][rows] for name in names)
+        means += (_offset(file) - start).astype(np.float32)
         return Gaussians(means, quats, scales, opacities * present, colors, antialiased=file.antialiased)
 
     metadata = {name: text for name, text in first.metadata.items() if name == "up"} | metadata
     return MovingFile(lambda t: frame(round(t * (len(files) - 1))), len(files), metadata)
+
+
+def _offset(file: SceneFile) -> NDArray[np.float64]:
+    return np.array(json.loads(file.metadata.get("offset", "[0, 0, 0]")), np.float64)
 
 
 def read_spacetime_ply(path: Path) -> MovingFile | None:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.ply import MAX_LOG_SCALE, GaussianSnapshot, gaussian_names, snapshot_of, vertex_of
 from lapgs_wgpu.io.ply_colors import SH_C0, read_colors
-from lapgs_wgpu.io.ply_elements import BAD_SHARE, Floats, PathLike, PlyFile
+from lapgs_wgpu.io.ply_elements import BAD_SHARE, Element, Floats, PathLike, PlyFile
 
 _MOTION = re.compile(  # words of a property's name that speak of time or of motion
     "(.*_)?(trbf|motion|omega|velocity|vel|v[xyz]|rot_r|t|time|timestamp|duration|lifetime|poly|fourier|traj|deform|temporal)"
@@ -20,13 +22,14 @@ _MOTION = re.compile(  # words of a property's name that speak of time or of mot
 _FLAT = float(np.log(1e-7))  # log of the smallest scale that is drawn
 _SCALES, _UNTURNED = {"scale_0", "scale_1", "scale_2"}, {"rot_0": 1.0, "rot_1": 0.0, "rot_2": 0.0, "rot_3": 0.0}
 _OPAQUE = 20.0  # its sigmoid is 1 in float32
+_FAR = 100.0  # distance of the scene's middle from the origin, in extents of the scene
 
 
 def read_foreign(ply: PlyFile) -> tuple[GaussianSnapshot, dict[str, str]]:
     """The Gaussians of a 3DGS .ply of any program, and as metadata what else it says. Notes go to stderr.
 
     Metadata: `antialiased` is "true" where a comment says so; `up`, an axis such as "z" or "-y", is the comment's
-    vertical axis.
+    vertical axis; `offset` is a JSON list of 3 numbers, which were taken off the means.
 
     Degree 0 may be given as colors; the third scale of flat Gaussians, or two scales and the quaternion of spherical
     ones, may be missing; a note names the properties that are not used. An infinite opacity is opaque, or
@@ -66,11 +69,42 @@ def read_foreign(ply: PlyFile) -> tuple[GaussianSnapshot, dict[str, str]]:
     axis = re.search(r"(?:vertical|up)[ _]?axis\s*[:=]\s*\+?(-?[xyz])\b", text, re.IGNORECASE)
     if axis:
         metadata["up"] = axis[1].lower()
+    offset = _take_off_offset(ply, vertex, values)
+    if offset is not None:
+        metadata["offset"] = json.dumps(offset)
+        _note(ply.path, f"lies far from the origin: {offset} is taken off all coordinates")
     return snapshot_of(_mended(values, ply.path), names, ply.path), metadata
 
 
 def _note(path: PathLike, text: str) -> None:
     print(f"note: {path}: {text}.", file=sys.stderr)
+
+
+def _take_off_offset(ply: PlyFile, vertex: Element, values: Floats) -> list[float] | None:
+    """Move the means in `values` to the origin where float32 would hold few digits of them; return what is taken off.
+
+    Such places are read again in float64: in float32 they are terraces.
+    """
+    middle, extent = _middle_and_extent(values[:, :3].astype(np.float64))
+    if np.abs(middle).max() <= _FAR * extent:
+        return None
+    exact = ply.columns(vertex, ["x", "y", "z"], np.float64)
+    middle, extent = _middle_and_extent(exact)
+    if extent == 0:
+        return None
+    offset = np.round(middle, max(0, -int(np.floor(np.log10(extent)))))
+    with np.errstate(all="ignore"):
+        values[:, :3] = exact - offset
+    return [float(value) for value in offset]
+
+
+def _middle_and_extent(means: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Median (3,) of means (N, 3), and the longest side of the box around nine tenths of them; 0 of no finite ones."""
+    finite = means[np.isfinite(means).all(axis=1)]
+    if not len(finite):
+        return np.zeros(3), 0.0
+    low, middle, high = np.quantile(finite, [0.05, 0.5, 0.95], axis=0)
+    return middle, float((high - low).max())
 
 
 def _mended(values: Floats, path: PathLike) -> Floats:

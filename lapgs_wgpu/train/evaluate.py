@@ -5,6 +5,7 @@ Both sides are compared as 8-bit pictures: the model of the last step, clamped a
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import time
 from collections.abc import Sequence
@@ -28,6 +29,7 @@ from lapgs_wgpu.train.image_metrics import MS_SSIM_SMALLEST, differing_pixels, m
 from lapgs_wgpu.train.lpips import SMALLEST, Lpips
 
 ERROR_GAIN = 4  # of the error pictures
+OFF_PATH = 0.05  # of the median depth: how far beside a view's camera pictures of what moves are drawn, too
 PARTS = ("psnr_moving", "ssim_moving", "psnr_still", "ssim_still", "explained")
 MEASURES = ("psnr", "ssim", "ms_ssim", "lpips", "lpips_unscaled", *PARTS)
 NOT_AVAILABLE = "not available"
@@ -51,7 +53,7 @@ def evaluate(
     that of the loss; ms_ssim; lpips on inputs in [-1, 1], and lpips_unscaled on inputs in [0, 1], as 3DGS's code
     reports it. Where masks say what moves: psnr_moving and
     ssim_moving inside them, psnr_still and ssim_still outside, explained the share of the moving pixels that are drawn
-    as they are (`differing_pixels`).
+    as they are (`differing_pixels`); a picture off_NAME.png shows such a view from OFF_PATH to the left and right.
     "not available" stands for what cannot be measured: pictures too small, no weights, no masks, nothing that moves.
     progress: takes a step for each view.
     Raises InputError where there are no views, or a picture or a mask cannot be read.
@@ -70,6 +72,9 @@ def evaluate(
         if folder is not None:
             with atomic_write(folder / f"{view.name}.png") as file:
                 file.write(encode_png(side_by_side(truth, image)))
+            if view.moving is not None:
+                with atomic_write(folder / f"off_{view.name}.png") as file:
+                    file.write(encode_png(_off_path(scene, view, color)))
         if progress is not None:
             progress.step()
     return {
@@ -115,6 +120,20 @@ def _parts(image: Tensor, truth: Tensor, moving: NDArray[np.bool_] | None) -> di
         measures[f"ssim_{name}"] = float(ssim(image, truth, pixels))
     differing = differing_pixels(truth.numpy(), image.numpy())
     return measures | {"explained": float(1 - differing[moving].mean())}
+
+
+def _off_path(scene: Scene4D, view: View, color: Tensor) -> NDArray[np.uint8]:
+    """(H, 2 W, 3) a view from the left and from the right of its camera."""
+    drawn = scene.render(view.camera, view.time, color)
+    shown = drawn.alpha > 0.5
+    depth = float((drawn.depth[shown] / drawn.alpha[shown]).median()) if shown.any() else 1.0
+    pictures = []
+    for way in (OFF_PATH, -OFF_PATH):  # the world moves the other way
+        shift = np.eye(4)
+        shift[0, 3] = way * depth
+        camera = dataclasses.replace(view.camera, T_cam_world=shift @ view.camera.T_cam_world)
+        pictures.append(_render(scene, dataclasses.replace(view, camera=camera), color))
+    return np.concatenate(pictures, axis=1)
 
 
 def _mean(name: str, values: list[Any]) -> float | str:
