@@ -77,8 +77,9 @@ def parse_options(arguments: list[str]) -> dict[str, typing.Any]:
     add = parser.add_argument
     parts = "; ".join(f"{name} ({text})" for name, (text, _, _) in ABLATIONS.items())
     add("preset", nargs="?", metavar="PRESET",
-        help=f"preset configuration: {', '.join(presets)}; or the path of a .toml file: RUN/config.toml, or your "
-        'own, which starts with base = "dnerf" or another preset, and names what differs')
+        help=f"preset configuration: {', '.join(presets)} (names with a scene, such as hypernerf-broom, have the "
+        "settings published for that scene), or the path of a .toml file: RUN/config.toml, or your own, which starts "
+        'with base = "dnerf" or another preset, and names what differs')
     add("--field", metavar="NAME", help="method: static (3DGS, no motion), mlp (deformable 3DGS), hexplane (4D-GS), "
         "grid4d (Grid4D) or laplacian (the paper's). All but laplacian also turn off the paper's losses (loss.pyramid, "
         "loss.ncc) and its adaptive split (density.split) [the preset's]")

@@ -125,7 +125,7 @@ def test_a_scan_of_the_whole_building(tmp_path: Path) -> None:
     capture(tmp_path / "scan", ply_file_path="scan.ply")
     (tmp_path / "scan.ply").rename(tmp_path / "scan/scan.ply")
     data = load_dataset(tmp_path / "scan")
-    assert data.normalization.scale == pytest.approx(BOX / 0.5, rel=0.05)
+    assert data.scale == pytest.approx(BOX / 0.5, rel=0.05)
 
 
 def test_a_scan_that_cameras_hardly_see(tmp_path: Path) -> None:
@@ -139,7 +139,7 @@ def test_a_scan_that_cameras_hardly_see(tmp_path: Path) -> None:
     assert data.normalization is not None
     np.testing.assert_allclose(data.cloud.points[:1000], data.normalization.points(scene), atol=1e-4)
     assert told(data, "% of its points: of 5000")
-    assert data.normalization.scale == pytest.approx(BOX / 0.5, rel=0.05)
+    assert data.scale == pytest.approx(BOX / 0.5, rel=0.05)
 
 
 def test_orientation_where_no_size_is_stated(tmp_path: Path) -> None:

@@ -290,6 +290,15 @@ def test_masks_that_the_file_names_leave_out_what_is_black(device: Device, tmp_p
 # nerfies, HyperNeRF
 
 
+def test_lenses_are_ignored_as_published_where_asked(device: Device, tmp_path: Path) -> None:
+    folder = write_nerfies(tmp_path / "toy", device, lens={**LENS, "skew": -2.0}, principal=(3, 2))
+    for view in load_dataset(folder, undistort=False).train:
+        K = view.camera.K
+        assert (K[0, 2], K[1, 2], K[0, 1]) == (WIDTH / 2, HEIGHT / 2, 0)
+        assert K[0, 0] * np.tan(0.45) == pytest.approx(WIDTH / 2)
+        np.testing.assert_array_equal(view.load(), np.asarray(Image.open(view.source)))
+
+
 @pytest.mark.parametrize("empty", [GONE, []])
 def test_splits_of_interpolation(empty: Any, device: Device, tmp_path: Path) -> None:
     """Without val_ids every fourth frame is trained on, and those halfway between are tested."""
@@ -369,4 +378,4 @@ def test_a_phone_on_a_tripod(device: Device, tmp_path: Path) -> None:
     assert any("is a guess" in warning for warning in data.warnings)
     assert data.depths is not None
     assert 0.1 < data.depths[0] < data.depths[1] < 10
-    assert 0.1 < data.normalization.scale < 10
+    assert 0.1 < data.scale < 10

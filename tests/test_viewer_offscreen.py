@@ -259,13 +259,16 @@ def test_mistakes_end_in_one_sentence(
     assert [file.name for file in tmp_path.iterdir()] == ["used"]
 
 
-def test_the_capture_opens_as_the_training_opened_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("line", "expected"), [("undistort = false", False), ("", True)])
+def test_the_capture_opens_as_the_training_opened_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str, expected: bool
+) -> None:
     opened: list[dict[str, object]] = []
     monkeypatch.setattr(
         "lapgs_wgpu.data.load_dataset",
         lambda path, **given: opened.append(given) or SimpleNamespace(test=("a",), train=("b",)),
     )
-    (tmp_path / "config.toml").write_text(f'[data]\npath = "{tmp_path}"\nsize = 200\nmovers = "masks"\n')
+    (tmp_path / "config.toml").write_text(f'[data]\npath = "{tmp_path}"\nsize = 200\nmovers = "masks"\n{line}\n')
     scene = SimpleNamespace(path=tmp_path / "checkpoint.ply", playback=SimpleNamespace(metadata={}))
     assert capture_views(scene) == ("a", "b")  # type: ignore[arg-type]
-    assert opened == [{"image_size": 200, "movers": "masks"}]
+    assert opened == [{"image_size": 200, "undistort": expected, "movers": "masks"}]

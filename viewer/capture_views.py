@@ -23,8 +23,12 @@ def capture_views(scene: LoadedScene) -> tuple[View, ...]:
 
     try:
         data = read_toml(scene.path.parent / "config.toml")["data"]
-        movers = data.get("movers") or None  # which tell where the scene lies
-        dataset = load_dataset(Path(data["path"]), image_size=int(data["size"]) or None, movers=movers)
+        dataset = load_dataset(
+            Path(data["path"]),
+            image_size=int(data["size"]) or None,
+            undistort=bool(data.get("undistort", True)),
+            movers=data.get("movers") or None,  # which tell where the scene lies
+        )
     except (OSError, ValueError, KeyError, TypeError, OverflowError):  # InputError is a ValueError
         return ()
     return (*dataset.test, *dataset.train)

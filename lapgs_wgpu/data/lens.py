@@ -48,6 +48,11 @@ class Lens:
         """Whether the lens has neither distortion nor skew."""
         return not (any(self.radial) or any(self.tangential) or self.skew)
 
+    @property
+    def idealized(self) -> Lens:
+        """A pinhole of the same focal lengths that looks at the image's center, as much published code takes it."""
+        return Lens(self.width, self.height, self.fx, self.fy, self.width / 2, self.height / 2)
+
     def resized(self, width: int, height: int) -> Lens:
         """The same lens for images of another size."""
         x, y = width / self.width, height / self.height

@@ -38,6 +38,7 @@ def load_dataset(
     folder: str | Path,
     *,
     image_size: int | None = None,
+    undistort: bool = True,
     masks: str | Path | None = None,
     movers: str | Path | None = None,
 ) -> Dataset:
@@ -46,6 +47,8 @@ def load_dataset(
     Args:
         folder: of the capture.
         image_size: longer side in pixels, 1 or more, to which larger images are shrunk; None keeps their size.
+        undistort: False takes images as they are, and cameras as pinholes that look at the center of the image,
+            whatever the files say of distortion, skew and principal point, as published code on HyperNeRF does.
         masks: folder with a PNG for each training image, under its name, white where the training loss ignores it.
         movers: the same for each image, white where something moves; a name is one in the capture's folder.
 
@@ -60,7 +63,10 @@ def load_dataset(
         raise InputError(f"image_size must be at least 1 pixel, got {image_size}.")
     reader = _reader(folder)
     capture = reader.read(folder, image_size)
-    frames, warnings = upright(capture.frames)
+    frames = list(capture.frames)
+    if not undistort:
+        frames = [dataclasses.replace(frame, lens=frame.lens.idealized) for frame in frames]
+    frames, warnings = upright(frames)
     warnings = [*capture.warnings, *warnings, *check_plausible(frames)]
     frames, time_source = _timed(folder, dataclasses.replace(capture, frames=frames), warnings)
     check_frames(frames)
@@ -110,6 +116,7 @@ def load_dataset(
         cloud=placement.cloud,
         depths=placement.depths,
         normalization=whole,
+        scale=1.0 if fit is None else fit.scale,
         warnings=tuple(warnings),
         time_source=time_source,
         own_footage=capture.own_footage,

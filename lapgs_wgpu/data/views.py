@@ -70,6 +70,7 @@ class Dataset:
 
     val: validation views, to choose settings by; none in most formats.
     cloud: point cloud for the initial Gaussians. depths: nearest and furthest depth, world units, if stated or derived.
+    scale: world units per unit of length of the capture (HyperNeRF: after its scene.json), 1 if coordinates were kept.
     normalization: transform from the files' coordinates, None if they were kept. warnings: problems that do not prevent
     a training, one sentence each. time_source: field and file of the times, for errors.
     own_footage: poses were estimated from the images. summary: how the capture was understood, in one line.
@@ -82,6 +83,7 @@ class Dataset:
     cloud: Cloud | None = None
     depths: tuple[float, float] | None = None
     normalization: Normalization | None = None
+    scale: float = 1.0
     warnings: tuple[str, ...] = ()
     time_source: str = "time"
     own_footage: bool = False

@@ -17,6 +17,7 @@ from lapgs_wgpu.motion.fields.config import FieldConfig
 Background = Literal["black", "white", "random"]
 BACKGROUND_LEVELS = {"black": 0.0, "white": 1.0, "random": 0.0}  # under views that are measured
 Split = Literal["plain", "adaptive"]
+Units = Literal["world", "capture"]
 StepPlace = Literal["auto", "exchange", "resident"]
 RefineCameras = Literal["auto", "on", "off"]
 
@@ -30,6 +31,11 @@ class DataConfig(Options):
         "color behind the Gaussians and behind transparent images; random: a new one each step, black in evaluation"
     )
     cache_gb: float = option("memory limit for the images that are kept on the device, gigabytes")
+    undistort: bool = option("resample images of lenses with distortion or skew to those of a pinhole camera", True)
+    units: Units = option(
+        "length unit of rates.means, smoothness.reach, field.bound and field.unit; capture: that of its files",
+        "world",
+    )
     masks: str = option(
         "folder with a mask for each training image; the loss ignores white pixels; such as masks/ of lapgs-prepare", ""
     )

@@ -30,6 +30,7 @@ def open_dataset(config: Config) -> Dataset:
     return load_dataset(
         data.path,
         image_size=data.size or None,
+        undistort=data.undistort,
         masks=data.masks or None,
         movers=data.movers or None,
     )

@@ -43,8 +43,6 @@ REMOVED = {
     "acceleration.frames": "it is 2",
     "cameras.focal": "focal lengths are taken as they are",
     "data.split": "a run is measured on its test views",
-    "data.undistort": "images of lenses with distortion are undistorted",
-    "data.units": "lengths are in world units",
     "decoder": "it is in torch where the step is, and on the device where that is; step_place says which",
     "density.divergence_weight": "it is 0.5",
     "density.max_screen_radius": "density.max_world_size bounds sizes",
@@ -61,10 +59,12 @@ REMOVED = {
     "schedule.batch": "a step takes one image",
 }
 
+_SCENES = "published-scenes"  # the file with presets of single scenes
+
 
 def preset_names() -> list[str]:
     """The presets that come with the package."""
-    return sorted(_packaged())
+    return sorted(name for name in _packaged() if not name.startswith("_"))
 
 
 def load_config(
@@ -184,7 +184,8 @@ def _read_packaged(name: str) -> Table:
 def _packaged() -> dict[str, Table]:
     """The tables of configs/ by name. No caller changes them."""
     folder = Path(str(importlib.resources.files("lapgs_wgpu.configs")))
-    return {file.stem: read_toml(file) for file in folder.glob("*.toml")}
+    presets = {file.stem: read_toml(file) for file in folder.glob("*.toml")}
+    return presets | presets.pop(_SCENES)
 
 
 def _remove(table: Any, key: str) -> bool:

@@ -61,7 +61,7 @@ def set_up(
 
 
 def resolve_for_dataset(config: Config, dataset: Dataset) -> Config:
-    """The configuration with no more frequencies than the training times can tell apart.
+    """The configuration with lengths in world units, and no more frequencies than the training times can tell apart.
 
     Raises InputError where the data do not allow it.
     """
@@ -71,6 +71,17 @@ def resolve_for_dataset(config: Config, dataset: Dataset) -> Config:
             "--timing.refine false."
         )
     field = config.field
+    if config.data.units == "capture":
+        scale, means = dataset.scale, config.rates.means
+        field = dataclasses.replace(field, bound=scale * field.bound, unit=scale * field.unit)
+        config = dataclasses.replace(
+            config,
+            data=dataclasses.replace(config.data, units="world"),
+            rates=dataclasses.replace(
+                config.rates, means=dataclasses.replace(means, start=scale * means.start, end=scale * means.end)
+            ),
+            smoothness=dataclasses.replace(config.smoothness, reach=scale * config.smoothness.reach),
+        )
     # All frequencies above the limit would end there.
     most = 1 + math.floor(nyquist_frequency(dataset) / field.frequency_step + 1e-9)
     return dataclasses.replace(config, field=dataclasses.replace(field, components=min(field.components, most)))
