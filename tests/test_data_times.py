@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import unicodedata
 from collections.abc import Callable, Sequence
@@ -208,6 +209,27 @@ def test_times_in_names(kind: str, tmp_path: Path) -> None:
     expected = np.linspace(0, 1, len(files))
     np.testing.assert_allclose([times[file] for file in files], expected, atol=1e-3 if kind == "decimals" else 1e-6)
     assert not any("order" in warning for warning in data.warnings)
+
+
+@pytest.mark.parametrize("start", ["235855", "095855", "09-58-55", "IMG_09.58.55"])
+def test_times_of_day_without_a_date(start: str, tmp_path: Path) -> None:
+    """Every two seconds, past a minute, an hour or midnight."""
+    h, m, s = (int(digits) for digits in re.findall(r"\d\d", start))
+    seconds = [(3600 * h + 60 * m + s + 10 * i) % 86400 for i in range(12)]
+    stamps = [f"{t // 3600:02d}{t // 60 % 60:02d}{t % 60:02d}" for t in seconds]
+    separator = next((each for each in "-." if each in start), "")
+    before = "IMG_" if start.startswith("I") else ""
+    files = [before + separator.join(re.findall("..", stamp)) + ".png" for stamp in stamps]
+    data = load_dataset(write(tmp_path / "toy", files))
+    times = times_of(data)
+    np.testing.assert_allclose([times[file] for file in files], np.linspace(0, 1, 12), atol=1e-9)
+    assert "12 times from the clock times" in data.summary
+
+
+def test_six_digits_of_a_counter_are_no_times_of_day(tmp_path: Path) -> None:
+    files = [f"{50 * i:06d}.png" for i in range(12)]  # 000050, 000100, 000150: as times of day, too
+    data = load_dataset(write(tmp_path / "toy", files))
+    assert "from the frame numbers" in data.summary
 
 
 @pytest.mark.parametrize("names", [["part1/{:03d}.png", "part2/{:03d}.png"], ["clip/{:03d}.png", "more/{:03d}.png"]])

@@ -17,13 +17,14 @@ TIME_WORDS = {"frame", "fr", "time", "timestep", "timestamp", "ts", "t", "step",
 CAMERA_WORDS = {"cam", "camera", "c", "view", "kinect", "device"}
 FILLED = 1.25  # of the images: cameras times their moments, where a fifth of these may lack an image
 STILL = 0.02  # of the distance of cameras: the places of one that stands still are apart by less
-_CLOCK = re.compile(  # 20260110_095848, 2026-01-10 at 9.58.48 PM; digits after that are parts of a second
-    r"(?<!\d)(?P<date>(?:19|20)\d\d([-_.]?)\d\d\2\d\d)\D{0,4}"
+_CLOCK = re.compile(  # 20260110_095848, 2026-01-10 at 9.58.48 PM, 09-58-48; digits after that are parts of a second
+    r"(?<!\d)(?:(?P<date>(?:19|20)\d\d([-_.]?)\d\d\2\d\d)\D{0,4})?"
     r"(?P<hour>\d\d|(?<!\d)\d(?=[-_.:]))(?P<by>[-_.:]?)(?P<minute>\d\d)(?P=by)(?P<second>\d\d)"
     r"(?:[-_.]?(?P<part>\d{3}|\d{6}))?(?!\d)(?:\s?(?P<half>[AaPp])[Mm]\b)?"
 )
 _UNIX = re.compile(r"(?<!\d)(1\d{9})[-_.](\d{3,9})(?!\d)")
 _DECIMAL = re.compile(r"(?:(?<![\w.])|(?<=[_-]))(\d+(?:\.(\d+))?)s?(?![\w.])")  # 0.25, t_0.25, 0.25s
+_DAY = 86400.0  # seconds
 
 
 class ImageName(NamedTuple):
@@ -154,6 +155,7 @@ def clock_times(names: Sequence[ImageName]) -> tuple[list[float], str] | None:
     readings = (
         (_of_each(stamps, _date), "clock times"),
         (_of_each(stamps, _unix_seconds), "Unix times"),
+        (_times_of_day(names), "clock times (HHMMSS)"),
         (_decimals(stamps), "seconds"),
     )
     for seconds, kind in readings:
@@ -169,18 +171,46 @@ def _of_each(stamps: Sequence[str], read: Callable[[str], float | None]) -> list
 
 def _date(stamp: str) -> float | None:
     """Seconds of a date and a time of day."""
-    if not (found := _CLOCK.search(stamp)):
-        return None
-    hour, minute, second = (int(found[part]) for part in ("hour", "minute", "second"))
-    if found["half"]:
-        hour = hour % 12 + 12 * (found["half"] in "Pp")
-    if not (hour < 24 and minute < 60 and second < 60):
+    if not (found := _CLOCK.search(stamp)) or found["date"] is None or (clock := _time_of_day(found)) is None:
         return None
     try:
         day = datetime.strptime(re.sub(r"\D", "", found["date"]), "%Y%m%d").replace(tzinfo=UTC)
     except ValueError:  # 20261399_000001
         return None
-    return day.timestamp() + 3600 * hour + 60 * minute + second + float(f"0.{found['part'] or 0}")
+    return day.timestamp() + clock
+
+
+def _time_of_day(found: re.Match[str]) -> float | None:
+    """Seconds from midnight of a match of _CLOCK; None where it is no time of day."""
+    hour, minute, second = (int(found[part]) for part in ("hour", "minute", "second"))
+    if found["half"]:
+        hour = hour % 12 + 12 * (found["half"] in "Pp")
+    possible = hour < 24 and minute < 60 and second < 60
+    return 3600 * hour + 60 * minute + second + float(f"0.{found['part'] or 0}") if possible else None
+
+
+def _times_of_day(names: Sequence[ImageName]) -> list[float] | None:
+    """Seconds of HHMMSS without a date, also past midnight; None unless all are possible times of day, alike in all
+    else that the names of a camera hold, and more even as times than as numbers, which jump by 40 each minute."""
+    found = [_CLOCK.search(name.stamp) for name in names]
+    matches = [match for match in found if match and match["date"] is None]
+    clocks = [clock for match in matches if (clock := _time_of_day(match)) is not None]
+    around = {(name.camera, _CLOCK.sub("", name.stamp, count=1)) for name in names}
+    if len(clocks) < len(names) or len(around) > len({name.camera for name in names}):
+        return None
+    times = np.array(clocks)
+    ordered = np.sort(times)
+    pause = int(np.argmax(np.diff(ordered, append=ordered[-1])))
+    if pause + 1 < len(ordered) and ordered[pause + 1] - ordered[pause] > _DAY / 2:
+        times = np.where(times <= ordered[pause], times + _DAY, times)
+    numbers = np.array([float(re.sub(r"\D", "", match[0])) for match in matches])
+    return times.tolist() if _unevenness(times) < _unevenness(numbers) else None
+
+
+def _unevenness(values: NDArray[np.float64]) -> float:
+    """The largest step between ascending values, in usual ones."""
+    steps = np.diff(np.unique(values))
+    return float(steps.max() / np.median(steps)) if len(steps) else 0.0
 
 
 def _unix_seconds(stamp: str) -> float | None:
