@@ -1,4 +1,4 @@
-"""Exports say what they lost."""
+"""Exports say what they lost, and of which Gaussians."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lapgs_wgpu.motion.playback.playback import playback_of
 from lapgs_wgpu.motion.scene_file import SceneFile
 from lapgs_wgpu.viewer.cli import view_command
 from lapgs_wgpu.viewer.export import export_compact
-from lapgs_wgpu.viewer.export_loss import VISIBLE, export_psnr, of_playback
+from lapgs_wgpu.viewer.export_loss import measure, of_playback
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene, load_scene
 
 COUNT = 1000
@@ -46,14 +46,25 @@ def test_every_export_prints_what_it_lost(
     assert "warning" not in printed.err
 
 
-def test_a_loss_that_is_seen_lowers_the_figure(scene: LoadedScene, device: Device) -> None:
-    """A file in which some Gaussians near the focus lie elsewhere."""
+CHANGES = {
+    "means": (7, "7 of 1,006 Gaussians lie off"),
+    "log_scales": (8, "8 of 1,006 Gaussians have another size"),
+    "opacity_logits": (100, "99 of 1,006 Gaussians have another opacity"),  # one was as faint before
+    "sh_dc": (10, "10 of 1,006 Gaussians have another color"),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_the_gaussians_that_differ_are_told(scene: LoadedScene, device: Device, name: str) -> None:
+    """A file in which a property of some Gaussians near the focus is another."""
+    count, told = CHANGES[name]
     file = scene_of_outliers(COUNT)
-    assert export_psnr(scene, of_playback(playback_of(file, device))) == 100
-    means = file.gaussians["means"].copy()
-    means[np.argsort(np.linalg.norm(means, axis=1))[:7]] += 0.5
-    moved = replace(file, gaussians=file.gaussians | {"means": means})
-    assert export_psnr(scene, of_playback(playback_of(moved, device))) < VISIBLE
+    values = file.gaussians[name].copy()
+    near = np.argsort(np.linalg.norm(file.gaussians["means"], axis=1) + (np.arange(COUNT + 6) < 4))[:count]
+    values[near] += {"means": 0.5, "log_scales": 2.0, "opacity_logits": -12.0, "sh_dc": 9.0}[name]
+    loss = measure(scene, of_playback(playback_of(replace(file, gaussians=file.gaussians | {name: values}), device)))
+    assert loss.psnr < 40
+    assert loss.reason.startswith(told)
 
 
 def test_what_the_usual_steps_lose_is_stored_in_finer_ones(device: Device, tmp_path: Path) -> None:
@@ -62,7 +73,7 @@ def test_what_the_usual_steps_lose_is_stored_in_finer_ones(device: Device, tmp_p
     sizes = np.tile(np.log([0.4, 1e-5, 1e-5]).astype(np.float32), (COUNT + 6, 1))
     needles = replace(file, gaussians=file.gaussians | {"log_scales": sizes})
     scene = load_scene(save(tmp_path / "a.ply", needles), lambda: device)
-    psnr = export_compact(scene, tmp_path / "a.lapgs")
-    assert psnr >= 45
+    loss = export_compact(scene, tmp_path / "a.lapgs")
+    assert loss.psnr >= 45
     written = load_scene(tmp_path / "a.lapgs", lambda: device)
-    assert export_psnr(scene, of_playback(written.playback)) == psnr
+    assert measure(scene, lambda camera, t: (written.playback.at(t), np.arange(COUNT + 4))).psnr == loss.psnr

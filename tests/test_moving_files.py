@@ -37,7 +37,7 @@ def scene(device: Device, tmp_path_factory: pytest.TempPathFactory) -> LoadedSce
 def test_usd(scene: LoadedScene, device: Device, tmp_path: Path, ending: str) -> None:
     """usd-core's camera sees usd-core's positions within 0.1 pixels of where ours are, at three times."""
     file = tmp_path / f"a.{ending}"
-    assert export_usd(scene, file, 61) > 40
+    assert export_usd(scene, file, 61).psnr > 40
     stage = Usd.Stage.Open(str(file))
     splats = UsdVol.ParticleField3DGaussianSplat(stage.GetPrimAtPath("/World/Splats"))
     assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0, 60)
@@ -71,12 +71,12 @@ def test_a_sequence_and_back_to_usd(scene: LoadedScene, device: Device, tmp_path
     (tmp_path / "frames" / "frame_7.ply").touch()
     with pytest.raises(InputError, match="is not empty"):
         export_frames(scene, tmp_path / "frames", 4)
-    assert export_frames(scene, tmp_path / "frames", 4, overwrite=True) > 90
+    assert export_frames(scene, tmp_path / "frames", 4, overwrite=True).psnr > 90
     read = load_scene(tmp_path / "frames", lambda: device)
     assert (read.clock().frames, read.clock().seconds) == (4, pytest.approx(scene.clock().seconds))
     for t in (0.0, 1 / 3, 1.0):
         np.testing.assert_array_equal(read.playback.means(t), scene.playback.means(t))
-    assert export_usd(read, tmp_path / "b.usdc", 4) > 30  # straight lines between what were four frames
+    assert export_usd(read, tmp_path / "b.usdc", 4).psnr > 30  # straight lines between what were four frames
     with pytest.raises(InputError, match="no field"):
         export_compact(read, tmp_path / "b.lapgs")
 

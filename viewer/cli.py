@@ -162,7 +162,6 @@ def _video(given: Any, scene: LoadedScene) -> None:
 
 def _export(given: Any, scene: LoadedScene) -> None:
     from lapgs_wgpu.viewer import export
-    from lapgs_wgpu.viewer.export_loss import VISIBLE
 
     file, overwrite = Path(given.export), bool(given.overwrite)
     ending, count = file.suffix.lower(), scene.playback.count
@@ -172,25 +171,25 @@ def _export(given: Any, scene: LoadedScene) -> None:
     if ending == ".4dgs":
         from lapgs_wgpu.viewer.export_4dgs import MAX_ERROR, export_4dgs
 
-        psnr = export_4dgs(scene, file, given.max_error or MAX_ERROR)
+        loss = export_4dgs(scene, file, given.max_error or MAX_ERROR)
     elif ending in USD:
         from lapgs_wgpu.viewer.export_usd import export_usd
 
         frames = given.frames or max(61, scene.clock().frames) if scene.playback.moves else 1
-        psnr = export_usd(scene, file, frames)
+        loss = export_usd(scene, file, frames)
         line = f"{count} Gaussians at {frames} times"
     elif ending in (".lapgs", ".html"):
-        psnr = export.export_compact(scene, file)
+        loss = export.export_compact(scene, file)
     elif ending == ".ply":
-        psnr = export.export_still(scene, file, given.time or 0.0)
+        loss = export.export_still(scene, file, given.time or 0.0)
         line = f"{count} Gaussians at time {given.time or 0.0:g}"
     else:
-        psnr = export.export_frames(scene, file, given.frames, overwrite=overwrite)
+        loss = export.export_frames(scene, file, given.frames, overwrite=overwrite)
         line = f"{given.frames} frames of {count} Gaussians"
     size = f", {file.stat().st_size / 1e6:.2f} MB" if file.is_file() else ""
-    print(f"{file}: {line}{size}, {psnr:.1f} dB PSNR against {scene.path}")
-    if psnr < VISIBLE:
-        print(f"warning: below {VISIBLE:g} dB what the file lost is seen: look at it.", file=sys.stderr)
+    print(f"{file}: {line}{size}, {loss.psnr:.1f} dB PSNR against {scene.path}")
+    if loss.reason:
+        print(f"warning: the loss is seen: {loss.reason}.", file=sys.stderr)
     # Our own formats say whether the scene is antialiased; for .4dgs and OpenUSD opacities are fitted to plain drawing.
     if ending not in (".4dgs", ".lapgs", ".html", *USD) and scene.playback.at(0.0).antialiased:
         print(

@@ -11,10 +11,11 @@ import numpy as np
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.io.ply import write_ply
+from lapgs_wgpu.motion.compact_scene import held_rows
 from lapgs_wgpu.motion.playback.playback import DevicePlayback, playback_of
 from lapgs_wgpu.motion.scene_file import SceneFile, compact_bytes, read_compact, read_scene
 from lapgs_wgpu.progress import Progress
-from lapgs_wgpu.viewer.export_loss import export_psnr, of_playback
+from lapgs_wgpu.viewer.export_loss import Loss, measure, of_playback
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene, nearest_axis
 from lapgs_wgpu.viewer.moving_files import MANIFEST, SampledPlayback, read_sequence
 from lapgs_wgpu.viewer.offscreen import OffscreenRenderer
@@ -33,22 +34,22 @@ def check_free(scene: LoadedScene, file: Path, overwrite: bool) -> None:
         raise InputError(f"{file}: is there already; --overwrite replaces it.")
 
 
-def export_still(scene: LoadedScene, file: Path, time: float) -> float:
-    """Write the Gaussians at a time in [0, 1], and return the PSNR of what the file holds against the scene. Atomic.
+def export_still(scene: LoadedScene, file: Path, time: float) -> Loss:
+    """Write the Gaussians at a time in [0, 1], and compare what the file holds then with the scene. Atomic.
 
     Raises InputError where it cannot be written.
     """
     _write_still(scene, file, time)
-    return export_psnr(scene, of_playback(playback_of(read_scene(file), scene.playback.device)), time)
+    return measure(scene, of_playback(playback_of(read_scene(file), scene.playback.device)), time)
 
 
 def _write_still(scene: LoadedScene, file: Path, time: float) -> None:
     write_ply(file, scene.playback.snapshot(time), antialiased=scene.playback.at(time).antialiased)
 
 
-def export_frames(scene: LoadedScene, folder: Path, frames: int, *, overwrite: bool = False) -> float:
+def export_frames(scene: LoadedScene, folder: Path, frames: int, *, overwrite: bool = False) -> Loss:
     """Write a still frame_0000.ply for each of the times evenly from 0 to 1, and their manifest, into a new or an empty
-    folder; return the PSNR of what is played against the scene.
+    folder; compare what is played with the scene.
 
     overwrite: frames of an earlier export go, other files stay. Raises InputError where it cannot be written.
     """
@@ -80,11 +81,11 @@ def export_frames(scene: LoadedScene, folder: Path, frames: int, *, overwrite: b
     with atomic_write(folder / MANIFEST) as target:
         target.write(json.dumps(manifest, indent=1).encode())
     written = SampledPlayback(scene.playback.device, read_sequence(folder / MANIFEST))
-    return export_psnr(scene, of_playback(written), frames=frames)
+    return measure(scene, of_playback(written), frames=frames)
 
 
-def export_compact(scene: LoadedScene, file: Path) -> float:
-    """Write a compact scene (.lapgs), or a web page with one inside (.html), and return its PSNR. Atomic.
+def export_compact(scene: LoadedScene, file: Path) -> Loss:
+    """Write a compact scene (.lapgs), or a web page with one inside (.html), and compare it with the scene. Atomic.
 
     Raises InputError where it cannot be written, and where only torch evaluates the field.
     """
@@ -93,25 +94,26 @@ def export_compact(scene: LoadedScene, file: Path) -> float:
             f"{scene.path}: holds no field of lapgs_wgpu; --export takes a folder, or a .ply, .usd or .4dgs."
         )
     with atomic_write(file) as target:  # before a minute of work
-        content, psnr = _compact(scene, scene.file)
+        content, loss = _compact(scene, scene.file)
         if file.suffix.lower() == ".html":
             poster = OffscreenRenderer(scene)(scene.camera().camera(*_POSTER_SIZE), 0.0)
             content = page_html(content, file.stem, poster, narrowest=scene.initial_view.narrowest).encode()
         target.write(content)
-    return psnr
+    return loss
 
 
-def _compact(scene: LoadedScene, opened: SceneFile) -> tuple[bytes, float]:
-    """Encode a compact scene, in finer steps where the usual ones lose what may be seen; also return its PSNR."""
+def _compact(scene: LoadedScene, opened: SceneFile) -> tuple[bytes, Loss]:
+    """Encode a compact scene, in finer steps where the usual ones lose what may be seen; also return what it loses."""
     file = dataclasses.replace(opened, metadata=opened.metadata | {"view": scene.initial_view.to_json()})
     features = scene.playback.static_features() if isinstance(scene.playback, DevicePlayback) else None
-    best = b"", -np.inf
+    rows = held_rows(file.gaussians["opacity_logits"], file.field_config)
+    best = b"", Loss(-np.inf, "")
     for finer in _FINER:
         content = compact_bytes(file, features, finer=finer)
         written = playback_of(read_compact(content, file.path), scene.playback.device)
-        psnr = export_psnr(scene, of_playback(written))
-        if psnr > best[1] + 1:
-            best = content, psnr
-        if psnr >= _ENOUGH:
+        loss = measure(scene, of_playback(written, rows))
+        if loss.psnr > best[1].psnr + 1:
+            best = content, loss
+        if loss.psnr >= _ENOUGH:
             break
     return best

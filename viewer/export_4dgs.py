@@ -21,7 +21,7 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.constants import CONSTANTS
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.linear_light import directions, display_colors, linear_harmonics, sh_basis, to_display
-from lapgs_wgpu.viewer.export_loss import Written, export_psnr
+from lapgs_wgpu.viewer.export_loss import Loss, Written, measure, seen, upload
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene, nearest_axis
 from lapgs_wgpu.viewer.moving_files import AXES, LAST, SH_RANGE, harmonics_4dgs
 from lapgs_wgpu.viewer.plain_opacity import plain_factors
@@ -33,8 +33,8 @@ _TIME_STEP = 1e-3  # seconds: the library rounds the middles of pieces to it (pr
 _PROGRESS = 1000
 
 
-def export_4dgs(scene: LoadedScene, file: Path, max_error: float) -> float:
-    """Write a `.4dgs` of a scene that moves, and return the PSNR of what the library reads in it. Atomic.
+def export_4dgs(scene: LoadedScene, file: Path, max_error: float) -> Loss:
+    """Write a `.4dgs` of a scene that moves, and compare what the library reads in it with the scene. Atomic.
 
     Args:
         max_error: how far a point of the ellipsoid of one standard deviation of a Gaussian may lie from where the field
@@ -72,7 +72,7 @@ def export_4dgs(scene: LoadedScene, file: Path, max_error: float) -> float:
         written = io.BytesIO()
         fourdgs.write(written, _gaussian_set(pieces, sh, seconds), seconds, options=options, camera=view)
         target.write(written.getvalue())
-    return export_psnr(scene, _shown(fourdgs.read(written.getvalue()), playback.device))
+    return measure(scene, _shown(fourdgs.read(written.getvalue()), playback.device))
 
 
 def _gaussian_set(pieces: Pieces, sh: NDArray[np.float32], seconds: float) -> Any:
@@ -108,18 +108,13 @@ def _shown(scene: Any, device: Device) -> Written:
     gaussians = scene.gaussians
     light = harmonics_4dgs(gaussians)
 
-    def upload(values: NDArray[np.floating]) -> DeviceArray:
-        return DeviceArray.upload(device, "export loss", np.ascontiguousarray(values, np.float32))
-
-    def at(camera: Camera, t: float) -> Gaussians[DeviceArray]:
+    def at(camera: Camera, t: float) -> tuple[Gaussians[DeviceArray], NDArray[np.integer]]:
         now = gaussians.state_at(min(t, LAST) * scene.duration_sec)
         rows, means = now["indices"], now["centers"]
-        towards = means - camera.position
-        basis = sh_basis(towards / np.linalg.norm(towards, axis=1, keepdims=True), gaussians.sh_degree)
-        colors = to_display(np.einsum("nk,nkc->nc", basis, light[rows]).clip(0, 1))
+        colors = to_display(seen(means, light[rows], camera).clip(0, 1))
         quats = np.roll(gaussians.rotations[rows], 1, axis=1)  # xyzw to wxyz
         arrays = (means, quats, gaussians.scales[rows], now["opacity"], colors)
-        return Gaussians(*(upload(values) for values in arrays))
+        return Gaussians(*(upload(device, values) for values in arrays)), gaussians.source_index[rows]
 
     return at
 

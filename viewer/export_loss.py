@@ -2,27 +2,51 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.playback.playback import Playback
 from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.constants import CONSTANTS
 from lapgs_wgpu.splat.gaussians import Gaussians
+from lapgs_wgpu.splat.linear_light import sh_basis
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 from lapgs_wgpu.viewer.video import orbit_views
 
-Written = Callable[[Camera, float], Gaussians[DeviceArray]]  # what a file shows a camera at a time
+Floats = NDArray[np.floating]
+Rows = NDArray[np.integer]
+# What a file shows a camera at a time, and which Gaussians of the scene these are.
+Written = Callable[[Camera, float], tuple[Gaussians[DeviceArray], Rows]]
 
-VISIBLE = 40.0  # dB; below it a file has lost what is seen
 _PICTURES = 4
+_VISIBLE = 40.0  # dB; below it a file has lost what is seen
+# Property -> from which error on a Gaussian counts, and what it then does.
+_ERRORS = {
+    "means": (0.5, "lie off by more than half their size"),
+    "quats": (0.1, "are turned by more than 0.1 rad"),
+    "scales": (0.1, "have another size by more than a tenth"),
+    "opacities": (0.05, "have another opacity by more than 0.05"),
+    "sh": (0.05, "have another color by more than 0.05"),
+}
 
 
-def export_psnr(scene: LoadedScene, written: Written, time: float | None = None, frames: int | None = None) -> float:
-    """Draw pictures of a scene and of a file, from an orbit; return the PSNR of the worst, dB, at most 100.
+class Loss(NamedTuple):
+    """psnr: of the worst image, dB, at most 100. reason: which Gaussians differ; empty where the loss is not seen."""
+
+    psnr: float
+    reason: str
+
+
+def measure(scene: LoadedScene, written: Written, time: float | None = None, frames: int | None = None) -> Loss:
+    """Compare pictures of the captured images' size from around the focus.
 
     time: of all, in [0, 1]; by default from the clip's start to its end. frames: of a sequence, whose times the
     pictures have then.
@@ -30,19 +54,21 @@ def export_psnr(scene: LoadedScene, written: Written, time: float | None = None,
     rasterizer = Rasterizer(scene.playback.device)
     if time is None and not scene.playback.moves:
         time = 0.0
-    captured, errors = scene.initial_view.camera, []
+    pictures, captured = [], scene.initial_view.camera
     size = captured.width, captured.height
     for camera, t in orbit_views(scene.camera(), size, _PICTURES, time, scene.initial_view.arc):
         t = t if frames is None else round(t * (frames - 1)) / max(1, frames - 1)
         wanted = _draw(rasterizer, scene, scene.playback.at(t), camera)
-        found = _draw(rasterizer, scene, written(camera, t), camera)
-        errors.append(float(np.mean((found.astype(np.float64) - wanted) ** 2)))
-    return min(100.0, -10 * float(np.log10(max(max(errors), 1e-20))))
+        psnr = _psnr(wanted, _draw(rasterizer, scene, written(camera, t)[0], camera))
+        pictures.append((psnr, camera, t, wanted))
+    psnr, camera, t, wanted = min(pictures, key=lambda picture: picture[0])
+    return Loss(psnr, "" if psnr >= _VISIBLE else _reason(rasterizer, scene, written, camera, t, wanted))
 
 
-def of_playback(playback: Playback) -> Written:
-    """Draw what an opened file holds."""
-    return lambda camera, t: playback.at(t)
+def of_playback(playback: Playback, rows: Rows | None = None) -> Written:
+    """Draw what an opened file holds. rows: Gaussians of the scene that are in it, where not all."""
+    held = np.arange(playback.count) if rows is None else rows
+    return lambda camera, t: (playback.at(t), held)
 
 
 def _draw(
@@ -54,3 +80,63 @@ def _draw(
         if not rasterizer.grow_on_overflow(drawing):
             image: NDArray[np.float32] = drawing.image.read()[:3].clip(0, 1)
             return image
+
+
+def _psnr(true: Floats, found: Floats) -> float:
+    error = float(np.mean((found.astype(np.float64) - true) ** 2))
+    return min(100.0, -10 * math.log10(max(error, 1e-20)))
+
+
+def _reason(
+    rasterizer: Rasterizer, scene: LoadedScene, written: Written, camera: Camera, t: float, wanted: Floats
+) -> str:
+    """Which property, taken from the scene, brings the picture nearest to the scene's, and how many Gaussians differ in
+    it."""
+    device = scene.playback.device
+    shown, rows = written(camera, t)
+    exact = scene.playback.at(t)
+    true = {name: array.read()[rows] for name, array in exact.arrays().items()}
+    gains = {}
+    for name, values in true.items():
+        mended = Gaussians(**(shown.arrays() | {name: upload(device, values)}), antialiased=shown.antialiased)
+        gains[name] = _psnr(wanted, _draw(rasterizer, scene, mended, camera))
+    mended = dataclasses.replace(shown, antialiased=exact.antialiased)
+    if _psnr(wanted, _draw(rasterizer, scene, mended, camera)) > max(gains.values()):
+        return "the scene is drawn antialiased, which the file does not say"
+    name = max(gains, key=gains.__getitem__)
+    found = {name: array.read() for name, array in shown.arrays().items()}
+    most, differ = _ERRORS[name]
+    count = int((_errors(name, true, found, camera) > most).sum())
+    return f"{count:,} of {scene.playback.count:,} Gaussians {differ}"
+
+
+def _errors(name: str, true: dict[str, Floats], found: dict[str, Floats], camera: Camera) -> Floats:
+    """(N,) by how much a property of each Gaussian differs, as _ERRORS counts it."""
+    a: Floats = true[name].astype(np.float64)
+    b: Floats = found[name].astype(np.float64)
+    if name == "means":
+        return np.asarray(np.linalg.norm(a - b, axis=1) / np.median(true["scales"], axis=1))
+    if name == "quats":
+        cosine = np.abs((a * b).sum(axis=1)) / (np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1))
+        return np.asarray(2 * np.arccos(cosine.clip(0, 1)))
+    if name == "scales":
+        return np.asarray(np.abs(np.log(a / b)).max(axis=1))
+    if name == "sh":
+        a, b = (_colors(true["means"], sh, camera) for sh in (a, b))
+    return np.abs(a - b).reshape(len(a), -1).max(axis=1)
+
+
+def _colors(means: Floats, sh: Floats, camera: Camera) -> Floats:
+    """(N, 3) colors from a camera, of harmonics (N, K, 3) or as they are."""
+    return sh if sh.ndim == 2 else np.maximum(seen(means, sh, camera) + CONSTANTS["SH_OFFSET"], 0)
+
+
+def seen(means: Floats, sh: Floats, camera: Camera) -> Floats:
+    """(N, 3) sums of harmonics (N, K, 3) in the directions from a camera."""
+    towards = means - camera.position
+    basis = sh_basis(towards / np.linalg.norm(towards, axis=1, keepdims=True), int(sh.shape[1] ** 0.5) - 1)
+    return np.asarray(np.einsum("nk,nkc->nc", basis, sh))
+
+
+def upload(device: Device, values: Floats) -> DeviceArray:
+    return DeviceArray.upload(device, "export loss", np.ascontiguousarray(values, np.float32))

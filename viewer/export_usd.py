@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lapgs_wgpu.gpu.array import read_all
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.progress import Progress
-from lapgs_wgpu.viewer.export_loss import export_psnr, of_playback
+from lapgs_wgpu.viewer.export_loss import Loss, measure, of_playback
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene, direction, nearest_axis
 from lapgs_wgpu.viewer.moving_files import SampledPlayback
 from lapgs_wgpu.viewer.plain_opacity import plain_factors
@@ -26,8 +26,8 @@ _TYPES = {
 }  # fmt: skip
 
 
-def export_usd(scene: LoadedScene, file: Path, frames: int) -> float:
-    """Write Gaussians at `frames` times evenly from 0 to 1, and return the PSNR of what usd-core reads. Atomic.
+def export_usd(scene: LoadedScene, file: Path, frames: int) -> Loss:
+    """Write Gaussians at `frames` times evenly from 0 to 1, and compare what usd-core reads with the scene. Atomic.
 
     Coordinates are the scene's, below a transform that turns its up axis to z where it is neither y nor z. Values that
     do not change have one sample.
@@ -46,7 +46,7 @@ def export_usd(scene: LoadedScene, file: Path, frames: int) -> float:
             made = packed
         with made.open("rb") as source:
             shutil.copyfileobj(source, target)
-    return export_psnr(scene, of_playback(SampledPlayback(scene.playback.device, read_usd(file))))
+    return measure(scene, of_playback(SampledPlayback(scene.playback.device, read_usd(file))))
 
 
 def _write(pxr: Any, stage: Any, scene: LoadedScene, frames: int) -> None:
