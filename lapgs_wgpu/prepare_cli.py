@@ -30,7 +30,7 @@ programs, but the extra prepare: pip install "lapgs-wgpu[prepare]".
   lapgs-prepare walk.mp4 --out DIR --train      the same, then train a model that suits this machine and the film
   lapgs-prepare --check DIR                     measure what a capture is worth, and what to film differently
 
-See docs/own-data.md."""
+DIR/report.html shows what was found. See docs/own-data.md."""
 
 
 def prepare_command(arguments: Sequence[str] | None = None) -> int:
@@ -54,8 +54,8 @@ def options() -> Parser:
         "(transforms.json), Qualisys (.qca.txt), Pose2Sim (.toml), OpenCV (.yml) or Panoptic (.json); each film is "
         "named as its camera. Images are undistorted, and no training changes these cameras")
     add("--check", metavar="DIR", help="instead of films: measure the existing capture in DIR, of any format that "
-        "lapgs-train reads, and print parallax, path, motion, coverage and exposure. Can be combined with --train and "
-        "--minutes only")
+        "lapgs-train reads, print parallax, path, motion, coverage and exposure, and write DIR/report.html. "
+        "Can be combined with --train and --minutes only")
     add("--train", action="store_true", help="then train. Preset, image size and number of steps are chosen from the "
         "graphics adapter, the capture and a short measurement; the run folder is runs/NAME, NAME that of the capture")
     add("--minutes", type=float, metavar="M", help="with --train: how long the training takes, about, evaluation "
@@ -107,18 +107,31 @@ def check_options(given: argparse.Namespace) -> None:
 
 def _convert(given: argparse.Namespace, out: Path) -> None:
     from lapgs_wgpu.prepare.capture import prepare  # after --help: numpy and Pillow take a while
+    from lapgs_wgpu.prepare.capture_folder import RefusedError
+    from lapgs_wgpu.prepare.report import write_refusal
 
     paths = {name: Path(value) for name in ("masks", "poses", "calibration") if (value := getattr(given, name))}
-    done = prepare([Path(film) for film in given.films], out, fps=given.fps, **paths)
+    try:
+        done = prepare([Path(film) for film in given.films], out, fps=given.fps, **paths)
+    except RefusedError as error:
+        write_refusal(out, str(error))
+        raise
     print(f"{out}: {done.images} images, {done.placed} of {done.cameras} cameras placed", flush=True)
 
 
 def _measure(folder: Path) -> Diagnosis:
-    """Print what a capture is worth."""
+    """Print what a capture is worth, and write the report into its folder."""
+    from lapgs_wgpu.prepare.capture_folder import REPORT
     from lapgs_wgpu.prepare.diagnosis import diagnose
+    from lapgs_wgpu.prepare.report import write_report
 
     diagnosis = diagnose(folder)
     print(f"{folder}: {diagnosis}", flush=True)
+    try:
+        write_report(folder, diagnosis)
+        print(f"{folder / REPORT} shows it with pictures", flush=True)
+    except InputError as error:  # a training can follow all the same
+        print(f"note: {error}", file=sys.stderr, flush=True)
     return diagnosis
 
 

@@ -50,7 +50,7 @@ def test_one_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest
     times = json.loads((out / "times.json").read_text())
     assert COUNT - 3 <= len(times) <= COUNT + 1
     assert times == {f"{100 * i:08d}.jpg": i / 10 for i in range(len(times))}
-    assert sorted(child.name for child in out.iterdir()) == ["images", "masks", "sparse", "times.json"]
+    assert sorted(child.name for child in out.iterdir()) == ["images", "masks", "report.html", "sparse", "times.json"]
     for folder, suffix in (("images", ".jpg"), ("masks", ".png")):
         assert {file.stem + suffix for file in (out / folder).iterdir()} == {Path(n).stem + suffix for n in times}
     data = load_dataset(out)
@@ -109,7 +109,10 @@ def test_what_a_refusal_has_found_stays(film: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     assert prepare_command([str(film), "--out", str(out)]) == 2
     why = (out / "refused.txt").read_text()
+    page = (out / "report.html").read_text()
     assert re.search(r"\d+ of 8 images could be placed", why)
+    assert why[:40] in page
+    assert page.count("<img ") >= 2
     cameras = walk(4, *SIZE)
     still = [write_film(tmp_path / f"{i}.mp4", [drawn(camera, 0, Board())[0]] * 6) for i, camera in enumerate(cameras)]
     prepare(still, out)

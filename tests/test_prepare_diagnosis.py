@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,6 +14,7 @@ from PIL import Image
 
 from lapgs_wgpu.command import beside
 from lapgs_wgpu.prepare.diagnosis import Measure, _mask, diagnose
+from lapgs_wgpu.prepare.report import write_report
 from lapgs_wgpu.prepare_cli import prepare_command
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train import plan
@@ -142,13 +144,35 @@ def test_still_cameras(tmp_path: Path, seeing: int) -> None:
     assert "4 cameras that stand still" in str(found)
 
 
-def test_check_prints_the_measures(pictures, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_the_report_needs_no_other_file(pictures, tmp_path: Path) -> None:
     cameras, images, masks = pictures
-    folder = write_capture(tmp_path, cameras, images)
+    folder = write_capture(tmp_path / "<walk> & more", cameras, images)
     write_masks(folder, masks)
+    write_report(folder, diagnose(folder))
+    page = (folder / "report.html").read_text()
+    assert "&lt;walk&gt; &amp; more" in page
+    assert "<walk>" not in page
+    assert page.count("data:image/jpeg;base64,") == COUNT
+    assert page.count("<svg") == 1
+    assert len(re.findall(r'<circle cx="[\d.]+" cy="[\d.]+" r="3" fill="[^"]+"/>', page)) == COUNT
+    assert not re.findall(r'(?:src|href)="(?!data:)', page)
+    assert "what moves in red" in page
+    for name in ("parallax", "path", "moving share", "exposure"):
+        assert f"good  {name}: " in page
+
+
+def test_check_prints_and_writes(pictures, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    cameras, images, _ = pictures
+    folder = write_capture(tmp_path, cameras, images)
+    for _ in range(2):  # the page of an earlier run is replaced
+        assert prepare_command(["--check", str(folder)]) == 0
+        said = capsys.readouterr()
+        assert said.out.count("(wanted: ") == 4
+        assert "note: " not in said.err
+    (folder / "report.html").write_text("<title>mine</title>")
     assert prepare_command(["--check", str(folder)]) == 0
-    said = capsys.readouterr().out
-    assert [said.count(f"good  {name}: ") for name in ("parallax", "path", "moving share", "exposure")] == [1] * 4
+    assert "report.html" in capsys.readouterr().err
+    assert (folder / "report.html").read_text() == "<title>mine</title>", "a page of another program stays"
     assert prepare_command(["--check", str(folder / "images")]) == 2
 
 

@@ -15,6 +15,8 @@ from lapgs_wgpu.io.folder_lock import LOCK, locked_folder
 from lapgs_wgpu.io.listing import listed
 from lapgs_wgpu.prepare.masks import MASKS
 
+REPORT = "report.html"
+
 UNFINISHED, WORK, REFUSED = ".unfinished", "work", "refused.txt"
 
 
@@ -49,7 +51,7 @@ def appearing(out: Path) -> Iterator[Path]:
             raise
         try:
             if (out / REFUSED).is_file():
-                for name in (IMAGES, SPARSE, TIMES, MASKS, REFUSED):
+                for name in (IMAGES, SPARSE, TIMES, MASKS, REPORT, REFUSED):
                     shutil.rmtree(out / name) if (out / name).is_dir() else (out / name).unlink(missing_ok=True)
             for child in sorted(partial.iterdir()):
                 child.replace(out / child.name)
