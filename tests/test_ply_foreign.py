@@ -128,7 +128,7 @@ def test_an_antialiased_still_is_drawn_as_its_checkpoint(tmp_path: Path, device:
     scene.antialiased = True
     scene.save(tmp_path / "a.ply")
     loaded = load_scene(tmp_path / "a.ply", lambda: device)
-    assert export_still(loaded, tmp_path / "still.ply", 0.5) >= 100
+    assert export_still(loaded, tmp_path / "still.ply", 0.5).psnr >= 100
     assert b"\ncomment SplatRenderMode: mip\n" in (tmp_path / "still.ply").read_bytes()
     assert load(tmp_path / "still.ply", device).antialiased
     assert not load_scene(tmp_path / "still.ply", lambda: device, antialiased=False).playback.at(0.0).antialiased
