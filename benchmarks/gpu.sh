@@ -49,8 +49,7 @@ gsplat() {
 }
 
 # shellcheck disable=SC2086 # two words, or none
-train() { $limit $python -c 'import sys; from lapgs_wgpu.table_cli import table_command; sys.exit(table_command())' \
-  "$table" --data "$data" --out "$out/table"; }
+train() { $limit $python benchmarks/run_table.py "$table" --data "$data" --out "$out/table"; }
 
 failed=0
 for stage in "${@:-resident kernels passes gsplat train}"; do

@@ -17,11 +17,11 @@ from typing import Any
 from unittest import mock
 
 from measure import Timing, recording, summary
+from synthetic import write_synthetic
 from wgpu.backends.wgpu_native import GPUQueue
 
 from lapgs_wgpu import Trainer
 from lapgs_wgpu.data import load_dataset
-from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.gpu import native
 from lapgs_wgpu.gpu.device import Device, _adapters
 from lapgs_wgpu.train.presets import load_config

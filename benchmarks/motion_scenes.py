@@ -15,8 +15,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
-from lapgs_wgpu.data.raytrace import (
+from raytrace import (
     SAMPLES,
     Floats,
     Hits,
@@ -28,7 +27,8 @@ from lapgs_wgpu.data.raytrace import (
     solid_hits,
     turn_about_z,
 )
-from lapgs_wgpu.data.synthetic import camera_at, jumps
+from synthetic import camera_at, jumps
+
 from lapgs_wgpu.io.dataclass_table import Options, option
 from lapgs_wgpu.splat.camera import Camera
 

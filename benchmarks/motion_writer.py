@@ -16,11 +16,11 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from dnerf_writer import split_times, write_image, write_scene
 from motion_scenes import STILL_CAMERAS, MotionScene, fov_x, moving_objects, scene_cameras, trace
 from numpy.typing import NDArray
+from raytrace import SAMPLES, Hits, combine, pixel_means, to_bytes, to_pixels
 
-from lapgs_wgpu.data.dnerf_writer import split_times, write_image, write_scene
-from lapgs_wgpu.data.raytrace import SAMPLES, Hits, combine, pixel_means, to_bytes, to_pixels
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.dataclass_table import build_dataclass, field_types, from_text
 from lapgs_wgpu.splat.camera import Camera

@@ -12,10 +12,10 @@ from typing import Any
 from unittest import mock
 
 from measure import Timing, summary
+from synthetic import write_synthetic
 from timestamps import Profile
 
 from lapgs_wgpu.data import load_dataset
-from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.gpu import array as array_module
 from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import Device

@@ -10,9 +10,9 @@ from typing import Any
 from unittest import mock
 
 from measure import Timing, Traffic, count, recording, summary
+from synthetic import write_synthetic
 
 from lapgs_wgpu.data import load_dataset
-from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.run import train
 from lapgs_wgpu.train.log import Log

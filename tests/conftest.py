@@ -17,9 +17,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from synthetic import write_synthetic
 
 from lapgs_wgpu.data import Dataset, load_dataset
-from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.gpu.device import Device, _adapters, _matches
 from lapgs_wgpu.splat import rasterize as rasterize_module
 from lapgs_wgpu.splat.rasterizer import Rasterizer

@@ -11,9 +11,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from synthetic import write_synthetic
 
 from lapgs_wgpu import cli, command
-from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import NoAdapterError, quoted
 from lapgs_wgpu.gpu import device as device_module
 
@@ -60,20 +60,6 @@ def test_training_writes_a_run_and_prints_its_result(
     assert err.count("\n") == 3  # a note, and the last state of the progress lines, of steps and test views
     assert err.endswith("2/2 test views measured  0:00 left\n")
     assert f'path = "{scene}"' in (tmp_path / "runs" / "toys-tiny" / "config.toml").read_text()
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there is always a display")
-def test_no_run_is_replaced_where_no_window_opens(
-    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("glfw")
-    for name in ("DISPLAY", "WAYLAND_DISPLAY", "QT_QPA_PLATFORM"):
-        monkeypatch.delenv(name, raising=False)
-    (tmp_path / "checkpoint.ply").write_text("of an earlier run")
-    given = ["tiny", "--data", str(scene), *FAST, "--out", str(tmp_path), "--overwrite", "--view"]
-    assert cli.train_command(given) == 2
-    assert "there is no display): leave out --view" in capsys.readouterr().err
-    assert [child.name for child in tmp_path.iterdir()] == ["checkpoint.ply"]
 
 
 def test_a_runs_configuration_is_a_preset(run: Path, tmp_path: Path) -> None:
@@ -131,15 +117,9 @@ def test_evaluation_refuses_what_it_has_no_use_for(
     assert (run / "metrics.json").read_bytes() == before
 
 
-def test_the_built_in_scene_is_written_beside_the_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from lapgs_wgpu.train import open_dataset
-
-    monkeypatch.setattr(
-        open_dataset, "write_synthetic", lambda folder: write_synthetic(folder, size=16, train_views=2, test_views=1)
-    )
-    assert cli.train_command(["tiny", "--data", "synthetic", "--out", str(tmp_path / "run"), *FAST]) == 0
+def test_the_built_in_scene_is_written_beside_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["tiny", "--data", "synthetic", "--out", str(tmp_path / "run"), *FAST, "--data.size", "16"]
+    assert cli.train_command(command) == 0
     assert (tmp_path / "synthetic" / "transforms_train.json").exists()
     assert f'path = "{tmp_path / "synthetic"}"' in (tmp_path / "run" / "config.toml").read_text()
     assert cli.train_command(["--eval", str(tmp_path / "run")]) == 0

@@ -184,7 +184,7 @@ NERFSTUDIO: list[Case] = [
 ARKIT: list[Case] = [(put(FILE, "frames", 1, "timestamp", GONE), "frame timestamp")]
 
 ID, TEST_ID = "left_000001", "left_000004"
-CAMERA, MASK = f"camera/{ID}.json", f"covisible/1x/val/{TEST_ID}.png"
+CAMERA = f"camera/{ID}.json"
 NERFIES: list[Case] = [
     *((gone(name), name) for name in ("scene.json", "metadata.json", CAMERA, "rgb")),
     (gone(f"rgb/1x/{ID}.png", "rgb/1x/left_000002.png"), f"rgb/1x/{ID}.png dataset.json"),
@@ -203,11 +203,6 @@ NERFIES: list[Case] = [
     (put(CAMERA, "focal_length", 1e9), f"{CAMERA} focal_length"),
     (put(CAMERA, "radial_distortion", [900, 0, 0]), f"{CAMERA} radial_distortion"),
     (put(CAMERA, "image_size", [64, 64]), f"rgb/1x 64x48 64x64 {CAMERA}"),
-    (text(MASK, "hello"), MASK),
-    (image(MASK, (64, 64), "L"), f"{MASK} 64x64 64x48"),
-    (image(MASK, (64, 48), "L"), MASK),
-    (lambda folder: (put("dataset.json", "train_ids", ["left_000000"])(folder),
-                     put("dataset.json", "val_ids", [ID, TEST_ID])(folder)), f"covisible/1x/val/{ID}.png"),
     (array("points.npy", np.zeros((0, 3))), "points.npy"),
     (array("points.npy", np.full((5, 3), NAN)), "points.npy"),
     # A cloud in other coordinates: moved as scene.json says, larger, smaller.

@@ -9,16 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import synthetic
+from synthetic import TOYS, cameras, render, write_synthetic
 
-from lapgs_wgpu.data import load_dataset, synthetic
-from lapgs_wgpu.data.synthetic import TOYS, cameras, render, write_synthetic
+from lapgs_wgpu.data import load_dataset
+from lapgs_wgpu.data.built_in import write_built_in
 from lapgs_wgpu.errors import InputError
 
 SMALL: dict[str, Any] = {"size": 24, "train_views": 5, "test_views": 2}
-
-
-def files(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def test_each_path_holds_one_frequency() -> None:
@@ -75,33 +73,20 @@ def test_written_scene_loads(tmp_path: Path) -> None:
         np.testing.assert_array_equal(view.load(), render(view.camera, view.time))
 
 
-def test_the_same_scene_is_reused_and_others_are_refused(tmp_path: Path) -> None:
-    folder = tmp_path / "toys"
-    folder.mkdir()
-    write_synthetic(folder, **SMALL)
+def test_the_package_holds_what_is_rendered(tmp_path: Path) -> None:
+    folder = write_built_in(tmp_path / "toys")
+    data = load_dataset(folder)
+    assert (len(data.train), len(data.val), len(data.test)) == (100, 20, 20)
+    for view in (data.train[0], data.train[61], data.test[7]):
+        np.testing.assert_array_equal(view.load(), render(view.camera, view.time))
+
+
+def test_it_is_unpacked_once_and_over_nothing_else(tmp_path: Path) -> None:
+    folder = write_built_in(tmp_path / "toys")
     picture = folder / "train/r_000.png"
-    stamp, before = picture.stat().st_mtime_ns, files(folder)
-    write_synthetic(folder, **SMALL)
-    assert picture.stat().st_mtime_ns == stamp
-    with pytest.raises(InputError, match=r"toys holds another built-in scene .*train_views 5 instead of 6"):
-        write_synthetic(folder, **(SMALL | {"train_views": 6}))
+    picture.write_bytes(b"mine")
+    assert write_built_in(folder) == folder
+    assert picture.read_bytes() == b"mine"
     (folder / "synthetic.json").write_text("{spoilt")
-    with pytest.raises(InputError, match="toys is not empty"):
-        write_synthetic(folder, **SMALL)
-    (folder / "synthetic.json").write_bytes(before["synthetic.json"])
-    assert files(folder) == before
-
-
-def test_an_interrupted_write_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = []
-
-    def interrupted(*args: Any) -> np.ndarray:
-        calls.append(args)
-        if len(calls) == 4:
-            raise KeyboardInterrupt
-        return render(*args)
-
-    monkeypatch.setattr(synthetic, "render", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        write_synthetic(tmp_path / "toys", **SMALL)
-    assert not list(tmp_path.iterdir())
+    with pytest.raises(InputError, match="toys is not the built-in scene"):
+        write_built_in(folder)

@@ -109,13 +109,6 @@ def test_view_refuses_pixels_of_another_shape(pixels: np.ndarray) -> None:
         view.load()
 
 
-@pytest.mark.parametrize("mask", [np.ones((5, 4), bool), np.ones((4, 5), np.uint8), np.zeros((4, 5), bool)])
-def test_view_refuses_masks_of_another_shape_or_of_nothing(mask: np.ndarray) -> None:
-    view = View("test_000", CAMERA, 0.0, "a.png", Source(), lambda: mask)
-    with pytest.raises(InputError, match=r"a\.png: expected a mask of 5x4"):
-        view.load_mask()
-
-
 @pytest.mark.parametrize("count", [1, 3, 97])
 def test_cameras_at_one_place_have_the_extent_of_the_scene(count: int) -> None:
     """Also where their mean is off by a rounding."""

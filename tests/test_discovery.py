@@ -10,11 +10,11 @@ import pytest
 import torch
 from motion_scenes import MotionScene, moving_objects, scene_cameras, trace
 from motion_writer import write_motion
+from raytrace import combine, pixel_means
 from scipy.spatial.transform import Rotation
+from synthetic import cameras
 
 from lapgs_wgpu.data import Dataset, load_dataset
-from lapgs_wgpu.data.raytrace import combine, pixel_means
-from lapgs_wgpu.data.synthetic import cameras
 from lapgs_wgpu.data.views import small_views
 from lapgs_wgpu.discovery import rigid_fit
 from lapgs_wgpu.discovery.acceptance import explained_share, rows_with, tracks_in_images

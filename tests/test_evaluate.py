@@ -33,8 +33,8 @@ def scene(device: Device) -> Scene4D:
     return Scene4D.from_points(points, colors, np.full(40, 0.1), FieldConfig(kind="static"), device=device)
 
 
-def view(name: str, pixels: np.ndarray, mask: np.ndarray | None = None) -> View:
-    return View(name, CAMERA, 0.5, name, lambda: pixels.copy(), None if mask is None else lambda: mask)
+def view(name: str, pixels: np.ndarray) -> View:
+    return View(name, CAMERA, 0.5, name, lambda: pixels.copy())
 
 
 def test_pictures_are_clamped_and_rounded() -> None:
@@ -124,20 +124,6 @@ def test_ms_ssim_written_out(size: tuple[int, int]) -> None:
     assert MS_SSIM_SMALLEST == 161
 
 
-def test_the_masked_measure_sees_the_pixels_of_the_mask_alone(scene: Scene4D) -> None:
-    drawn = to_8_bit(scene.render(CAMERA, 0.5).image)
-    mask = np.zeros((16, 24), bool)
-    mask[3:14, 5:20] = True
-    inside = drawn.copy()
-    inside[3:14, 5:20, 1] ^= 8  # of all that is measured, in one of three channels
-    both = np.where(mask[..., None], inside, 255 - drawn)
-    metrics = evaluate(scene, [view("inside", inside, mask), view("both", both, mask)], "black")
-    first, second = metrics["views"]
-    assert first["masked_psnr"] == pytest.approx(-10 * np.log10((8 / 255) ** 2 / 3), abs=1e-4)
-    assert first["psnr"] > second["psnr"]
-    assert first["masked_psnr"] == second["masked_psnr"] == metrics["masked_psnr"]
-
-
 def test_what_moves_is_measured_by_itself_and_drawn_from_beside(scene: Scene4D, tmp_path: Path) -> None:
     drawn = to_8_bit(scene.render(CAMERA, 0.5).image)
     moving = np.zeros((16, 24), bool)
@@ -159,13 +145,6 @@ def test_what_moves_is_measured_by_itself_and_drawn_from_beside(scene: Scene4D, 
     last = result_text(tmp_path).splitlines()
     assert last[0].startswith("warning: ")
     assert len(last) == 2
-
-
-def test_what_no_mask_measures_is_not_available(scene: Scene4D) -> None:
-    drawn = to_8_bit(scene.render(CAMERA, 0.5).image)
-    metrics = evaluate(scene, [view("with", drawn, np.ones((16, 24), bool)), view("without", drawn)], "black")
-    assert metrics["views"][0]["masked_psnr"] == pytest.approx(100)
-    assert metrics["views"][1]["masked_psnr"] == metrics["masked_psnr"] == "not available"
 
 
 @pytest.fixture(scope="module")

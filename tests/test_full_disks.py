@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 from helpers.faults import FAILING, Disk
 from helpers.training import configure
+from synthetic import write_synthetic
 
 from lapgs_wgpu import cli
-from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.gpu import device as device_module
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from synthetic import write_synthetic
 
 from lapgs_wgpu import Parts, Regularizer, Trainer, load_config, load_dataset
-from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.train.host import step_threads
 

@@ -43,7 +43,6 @@ FILES = {
     "COLMAP binary": ("sparse/0/*.bin", 120),
     "COLMAP": ("sparse/0/*.txt", 120),
     "Neu3D": ("poses_bounds.npy", 130),
-    "nerfies": ("covisible/1x/val/*.png", 60),
     "EndoNeRF": ("depth/000000.png", 60),
     "D-NeRF": ("train/*.png", 60),
     "Record3D": ("rgb/*.jpg", 60),
@@ -63,14 +62,13 @@ def capture_of(folder: Path, layout: str, device: Device) -> Path:
 
 
 def opened(folder: Path, file: Path, damaged: bytes) -> None:
-    """Open the capture, its first and last image, and a test image with its mask, while one file is damaged."""
+    """Open the capture, its first and last image, and a test image, while one file is damaged."""
     good = file.read_bytes()
     file.write_bytes(damaged)
     try:
         found = refused_or(lambda: load_dataset(folder))
         for view in (found.train[0], found.train[-1], found.test[0]) if found else ():
             refused_or(view.load)
-            refused_or(view.load_mask)
             assert np.isfinite(view.camera.T_cam_world).all()
         if found and found.cloud is not None:
             assert np.isfinite(found.cloud.points).all()

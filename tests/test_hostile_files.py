@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ import pytest
 from helpers.damaged_files import (
     FOREIGN,
     KINDS,
-    SPEC,
     compact_scenes,
     short_config,
     small_scene,
@@ -46,7 +44,6 @@ from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.scene_file import read_scene
-from lapgs_wgpu.table import read_spec
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run_folder import STATE, check_state, load_state, save_state
@@ -218,11 +215,3 @@ def test_configurations(folder: Path, changes: TreeEdits, edits: ByteEdits) -> N
     tree = {**dataclasses.asdict(short_config()), "base": "tiny", "record": {"torch": "2"}}
     (folder / "config.toml").write_bytes(edit_bytes(toml_text(edit_tree(tree, changes)), edits))
     refused_or(lambda: load_config(str(folder / "config.toml")))
-
-
-@fuzzed()
-@given(*TOML_EDITS)
-def test_specs_of_tables(folder: Path, changes: TreeEdits, edits: ByteEdits) -> None:
-    (folder / "spec.toml").write_bytes(edit_bytes(toml_text(edit_tree(tomllib.loads(SPEC), changes)), edits))
-    for run in refused_or(lambda: read_spec(folder / "spec.toml")) or ():
-        assert ".." not in Path(run.scene, run.row).parts  # they become folders

@@ -28,7 +28,6 @@ from lapgs_wgpu.io.safe_json_toml import MAX_TOML_BYTES, read_json, read_toml
 from lapgs_wgpu.motion.scene_file import read_scene
 from lapgs_wgpu.run import evaluate_run, resume
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.table import read_spec
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run_folder import STATE, load_state, save_state, start_run_folder
@@ -153,7 +152,7 @@ def test_pipes_and_devices_do_not_hang(tmp_path: Path) -> None:
     actions: list[Callable[[], Any]] = [
         lambda: read_json(tmp_path / "a.json"),
         lambda: read_json(tmp_path / "zero.json"),
-        lambda: read_spec(tmp_path / "a.toml"),
+        lambda: read_toml(tmp_path / "a.toml"),
         lambda: read_toml(tmp_path / "zero.toml"),
         lambda: load_state(tmp_path),
     ]

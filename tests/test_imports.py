@@ -67,10 +67,7 @@ ALLOWED = {
         "train",
         "run",
         "train_options",
-        "viewer",
     },
-    "table": {"errors", "gpu", "io", "train", "run"},
-    "table_cli": {"errors", "command", "gpu", "table", "train"},
 }
 FOLDERS = {"": PACKAGE, "viewer": Path(lapgs_wgpu.viewer.__file__).parent}  # where the parts lie on the disk
 FILES = sorted({Path(part) / file.relative_to(at) for part, at in FOLDERS.items() for file in at.rglob("*.py")})
@@ -197,7 +194,6 @@ def test_readers_need_neither_torch_nor_a_device_nor_scipy(module: str) -> None:
     [
         ("viewer.cli.view_command", SLOW),
         ("cli.train_command", SLOW),
-        ("table_cli.table_command", SLOW),
         ("prepare_cli.prepare_command", SLOW),
         ("doctor_cli.doctor_command", SLOW),
     ],

@@ -6,9 +6,9 @@ import dataclasses
 from pathlib import Path
 
 import pytest
+from synthetic import write_synthetic
 
 from lapgs_wgpu.data import Dataset, load_dataset
-from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import DeviceMemoryError, InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.train.config import Config

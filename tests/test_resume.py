@@ -20,11 +20,11 @@ import pytest
 import torch
 from helpers.interrupts import handled, interrupt_at
 from helpers.training import STEPS, configure
+from synthetic import write_synthetic
 
 from lapgs_wgpu import cli
 from lapgs_wgpu import run as run_module
 from lapgs_wgpu.data import Dataset
-from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io import atomic

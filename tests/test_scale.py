@@ -16,10 +16,10 @@ import pytest
 import torch
 from helpers.scenes import front_camera, random_scene
 from helpers.training import configure
+from synthetic import write_synthetic
 from torch import Tensor
 
 from lapgs_wgpu.data import Dataset, load_dataset
-from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.run import train

@@ -51,15 +51,6 @@ def test_orbit_keeps_focus_distance_and_horizon(view: ViewCamera) -> None:
         assert ahead(view)
 
 
-def test_looking_around_keeps_the_position(view: ViewCamera) -> None:
-    position, distance = view.position.copy(), view.distance
-    view.look(0.4, -0.3)
-    assert np.allclose(view.position, position)
-    assert view.distance == pytest.approx(distance)
-    assert level(view)
-    assert ahead(view)
-
-
 def test_pan_moves_the_focus_with_the_mouse(view: ViewCamera) -> None:
     focus, rotation = view.focus.copy(), view.rotation.copy()
     view.pan(0.25, -0.1)

@@ -11,9 +11,9 @@ import torch
 from helpers.ply_files import FIELDS, read_ply
 from helpers.scene_files import moving_scene
 from PIL import Image
+from synthetic import write_synthetic
 
 from lapgs_wgpu.data import load_dataset
-from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.gpu import device as device_module
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
@@ -93,7 +93,7 @@ def test_time_background_and_size_of_a_view(run: Path, scene: Scene4D, tmp_path:
 
 
 @kernels
-@pytest.mark.parametrize("mode", ["depth", "alpha", "motion", "dynamics"])
+@pytest.mark.parametrize("mode", ["depth", "alpha", "motion"])
 def test_every_mode_gives_a_picture(mode: str, run: Path, tmp_path: Path) -> None:
     view(run / "checkpoint.ply", "--screenshot", tmp_path / "a.png", "--mode", mode, "--size", "40x30")
     got = picture(tmp_path / "a.png")
@@ -268,7 +268,7 @@ def test_the_capture_opens_as_the_training_opened_it(
         "lapgs_wgpu.data.load_dataset",
         lambda path, **given: opened.append(given) or SimpleNamespace(test=("a",), train=("b",)),
     )
-    (tmp_path / "config.toml").write_text(f'[data]\npath = "{tmp_path}"\nsize = 200\n{line}\n')
+    (tmp_path / "config.toml").write_text(f'[data]\npath = "{tmp_path}"\nsize = 200\nmovers = "masks"\n{line}\n')
     scene = SimpleNamespace(path=tmp_path / "checkpoint.ply", playback=SimpleNamespace(metadata={}))
     assert capture_views(scene) == ("a", "b")  # type: ignore[arg-type]
-    assert opened == [{"image_size": 200, "normalize": True, "undistort": expected}]
+    assert opened == [{"image_size": 200, "undistort": expected, "movers": "masks"}]

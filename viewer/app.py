@@ -13,13 +13,13 @@ from lapgs_wgpu.viewer.view_state import ViewState
 from lapgs_wgpu.viewer.viewport import SETTLED, Viewport
 
 _GUI_DRAWS = 3  # after an event, until the panels have found their sizes and colors
-_LONGEST_STEP = 0.25  # seconds that the clip and a flight go on at once, after the window could not be drawn
+_LONGEST_STEP = 0.25  # seconds that the clip goes on at once, after the window could not be drawn
 
 
 class App:
     """A viewer on a rendercanvas and its event loop.
 
-    drawing_seconds: spent on drawing so far, GUI included. failed: what ended it, if the device did. end: called then.
+    failed: what ended it, if the device did. end: called then.
     """
 
     def __init__(self, canvas: Any, loop: Any, scene: LoadedScene) -> None:
@@ -30,7 +30,6 @@ class App:
         self._gui_draws = _GUI_DRAWS
         self.controls = Controls(self.state, self.viewport, covered=self._covered, wake=self._wake)
         self._drawn_at, self._running = time.perf_counter(), False
-        self.drawing_seconds = 0.0
         self.failed: DeviceError | None = None
         self.end: Callable[[], None] = canvas.close
         canvas.request_draw(self._draw)
@@ -46,9 +45,8 @@ class App:
         state, now = self.state, time.perf_counter()
         # Time passes between two frames of something that runs, not while the window was idle before it.
         passed = min(now - self._drawn_at, _LONGEST_STEP) if self._running else 0.0
-        self._drawn_at, self._running = now, state.clock.playing or self.controls.flying
+        self._drawn_at, self._running = now, state.clock.playing
         state.clock.advance(passed)
-        self.controls.fly(passed)
         self.viewport.draw(now)
         self.viewport.present()
         if self._gui is None:
@@ -58,11 +56,10 @@ class App:
         else:
             self._gui.render()
             self._gui_draws -= 1
-        if state.clock.playing or self.controls.flying or self._gui_draws > 0:
+        if state.clock.playing or self._gui_draws > 0:
             self.canvas.request_draw()
         elif not self.viewport.at_rest:
             self.loop.call_later(SETTLED, self.canvas.request_draw)
-        self.drawing_seconds += time.perf_counter() - now
 
     def _wake(self) -> None:
         self._gui_draws = _GUI_DRAWS

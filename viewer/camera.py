@@ -61,24 +61,15 @@ class ViewCamera:
         self._turn(right, down)
         self.position = self.focus - distance * self.rotation[2]
 
-    def look(self, right: float, down: float) -> None:
-        """Turn about the camera itself; radians."""
-        distance = self.distance
-        self._turn(-right, -down)
-        self.focus = self.position + distance * self.rotation[2]
-
     def pan(self, right: float, down: float) -> None:
         """Drag the scene, by these parts of the picture's height at the focus."""
         reach = 2 * self.distance * math.tan(0.5 * self.fov_y)
-        self._shift(-reach * (right * self.rotation[0] + down * self.rotation[1]))
+        by = -reach * (right * self.rotation[0] + down * self.rotation[1])
+        self.position, self.focus = self.position + by, self.focus + by
 
     def zoom(self, factor: float) -> None:
         """Multiply the distance to the focus."""
         self.position = self.focus + factor * (self.position - self.focus)
-
-    def fly(self, right: float, down: float, forward: float) -> None:
-        """Move by these lengths, world units, along the camera's axes."""
-        self._shift(np.array([right, down, forward]) @ self.rotation)
 
     def focus_on(self, point: ArrayLike) -> None:
         """Turn about another point from now on, which moves to the middle of the picture."""
@@ -90,9 +81,6 @@ class ViewCamera:
         f = 0.5 * height / math.tan(0.5 * self.fov_y)
         K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]])
         return Camera(K, world_to_camera(self.rotation.T, self.position), width, height, self.near)
-
-    def _shift(self, by: Vector) -> None:
-        self.position, self.focus = self.position + by, self.focus + by
 
     def _turn(self, right: float, down: float) -> None:
         """Turn the line of sight: about `up` so that the scene goes to the right, and about the horizontal axis. The

@@ -21,14 +21,13 @@ def capture_views(scene: LoadedScene) -> tuple[View, ...]:
     """
     from lapgs_wgpu.data import load_dataset  # not before the first picture
 
-    metadata = scene.playback.metadata  # empty for files of other projects; tells whether the capture was normalized
     try:
         data = read_toml(scene.path.parent / "config.toml")["data"]
         dataset = load_dataset(
             Path(data["path"]),
             image_size=int(data["size"]) or None,
-            normalize=not metadata or "placement" in metadata,
             undistort=bool(data.get("undistort", True)),
+            movers=data.get("movers") or None,  # which tell where the scene lies
         )
     except (OSError, ValueError, KeyError, TypeError, OverflowError):  # InputError is a ValueError
         return ()

@@ -6,16 +6,13 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from lapgs_wgpu.viewer.key_bindings import FLY, KEYS
+from lapgs_wgpu.viewer.key_bindings import KEYS
 from lapgs_wgpu.viewer.view_state import ViewState
 from lapgs_wgpu.viewer.viewport import Viewport
 
 _ACTIONS = {key.key: key.action for key in KEYS} | {"/": "show_help"}  # where "?" is told as "/" with Shift
 ORBIT = 0.008  # radians a pixel of dragging
-LOOK = 0.4 * ORBIT  # about the camera itself, where a turn moves more of the picture
 ZOOM = 0.0015  # of the distance's logarithm a pixel of the wheel
-FLY_REACH = 0.6  # of the distance to the focus a second
-_SPEEDS = {"Shift": 4.0, "Alt": 0.25}  # of a flight, while the key is held
 
 
 class Controls:
@@ -31,7 +28,6 @@ class Controls:
         self._covered, self._wake = covered, wake
         self.pointer = (0.0, 0.0)
         self._dragging: str | None = None
-        self._held: set[str] = set()  # of the keys that fly, and those that say how fast
         listen = viewport.canvas.add_event_handler
         listen(self._on_pointer_down, "pointer_down")
         listen(self._on_pointer_move, "pointer_move")
@@ -39,31 +35,12 @@ class Controls:
         listen(self._on_double_click, "double_click")
         listen(self._on_wheel, "wheel")
         listen(self._on_key_down, "key_down")
-        listen(self._on_key_up, "key_up")
-        listen(lambda event: self._held.clear(), "pointer_leave")  # its release may go to another window
         # Panels react to everything, so everything asks for a draw; what has not changed is only presented again.
         everything = ("pointer_down", "pointer_move", "pointer_up", "wheel", "key_down", "key_up", "char", "resize")
         listen(lambda event: wake(), *everything, order=-100)
 
-    @property
-    def flying(self) -> bool:
-        """Whether a key is held that moves the camera."""
-        return self.state.flying and not self._held.isdisjoint(FLY)
-
-    def fly(self, seconds: float) -> None:
-        """Move the camera by what the held keys say."""
-        if self.flying:
-            moves = [FLY[key] for key in self._held if key in FLY]
-            fast = math.prod(_SPEEDS[key] for key in self._held if key in _SPEEDS)
-            reach = seconds * FLY_REACH * fast * self.state.camera.distance
-            right, down, forward = (reach * sum(axis) for axis in zip(*moves, strict=True))
-            self.state.camera.fly(right, down, forward)
-
     def _on_key_down(self, event: dict[str, Any]) -> None:
-        key = _plain(event["key"])
-        if self.state.flying and (key in _SPEEDS or key in FLY):
-            self._held.add(key)
-            return
+        key = event["key"].lower() if len(event["key"]) == 1 else event["key"]  # letters without Shift
         action = _ACTIONS.get(key) if "Control" not in event["modifiers"] else None
         if action == "focus":
             self.viewport.focus(*self.pointer)
@@ -74,18 +51,10 @@ class Controls:
             else:
                 setattr(self.state, action, not value)
 
-    def _on_key_up(self, event: dict[str, Any]) -> None:
-        self._held.discard(_plain(event["key"]))
-
     def _on_pointer_down(self, event: dict[str, Any]) -> None:
-        state = self.state
         self.pointer = (event["x"], event["y"])
-        if self._covered(*self.pointer):
-            return
-        if event["button"] != 1 or "Shift" in event["modifiers"]:
-            self._dragging = "pan"
-        else:
-            self._dragging = "look" if state.flying else "orbit"
+        if not self._covered(*self.pointer):
+            self._dragging = "pan" if event["button"] != 1 or "Shift" in event["modifiers"] else "orbit"
 
     def _on_pointer_move(self, event: dict[str, Any]) -> None:
         state, (x, y) = self.state, (event["x"], event["y"])
@@ -93,8 +62,6 @@ class Controls:
         self.pointer = (x, y)
         if self._dragging == "orbit":
             state.camera.orbit(ORBIT * right, ORBIT * down)
-        elif self._dragging == "look":
-            state.camera.look(LOOK * right, LOOK * down)
         elif self._dragging == "pan":
             height = self.viewport.canvas.get_logical_size()[1]
             state.camera.pan(right / height, down / height)
@@ -112,8 +79,3 @@ class Controls:
         self.pointer = (event["x"], event["y"])
         if not self._covered(*self.pointer):
             self.state.camera.zoom(math.exp(ZOOM * event["dy"]))
-
-
-def _plain(key: str) -> str:
-    """The name of a key without Shift: letters are small."""
-    return key.lower() if len(key) == 1 else key

@@ -7,7 +7,6 @@ import time
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lapgs_wgpu.gpu.array import DeviceArray, read_all
 from lapgs_wgpu.gpu.device import Device
@@ -58,18 +57,11 @@ class FrameRenderer:
         self.playback = playback
         self._rasterizer = Rasterizer(playback.device)
         self._pool = BufferPool(playback.device)
-        self._values: dict[Mode, tuple[DeviceArray, float]] = {}
-
-    def forget(self) -> None:
-        """Drop what was measured of the scene, because it has changed."""
-        self._values.clear()
+        self._moved: tuple[DeviceArray, float] | None = None
 
     def modes(self) -> list[Mode]:
         """List the modes in which this scene has something to show."""
-        missing = set() if self.playback.moves else {"motion"}
-        if not self.playback.field_config.dynamics_size:
-            missing.add("dynamics")
-        return [mode for mode in MODES if mode not in missing]
+        return [mode for mode in MODES if mode != "motion" or self.playback.moves]
 
     def draw(self, request: FrameRequest) -> Frame:
         """Draw, and wait until it is done."""
@@ -77,7 +69,7 @@ class FrameRenderer:
         camera, mode = request.camera, request.mode
         low, high, background = 0.0, 1.0, request.background
         # Before the Gaussians: measuring may take them to other times.
-        value = self._value(mode) if mode in ("motion", "dynamics") else None
+        value = self._motion() if mode == "motion" else None
         gaussians = self.playback.at(request.time)
         if request.antialiased is not None:
             gaussians = dataclasses.replace(gaussians, antialiased=request.antialiased)
@@ -111,19 +103,11 @@ class FrameRenderer:
         low, high = np.percentile(depth[seen] / (1.0 - rest[seen]), [1, 99])
         return float(low), float(high)
 
-    def _value(self, mode: Mode) -> tuple[DeviceArray, float]:
-        """Return a value of each Gaussian as its color (N, 3), and the value at the end of the scale."""
-        if mode not in self._values:
-            value = self._motion() if mode == "motion" else self._dynamics()
-            array = self._pool.upload(mode, np.repeat(value[:, None], 3, axis=1))
-            self._values[mode] = array, max(float(np.percentile(value, 98)) if len(value) else 1.0, 1e-9)
-        return self._values[mode]
-
-    def _dynamics(self) -> NDArray[np.float32]:
-        attributes = self.playback.dynamics()
-        assert attributes is not None
-        return np.linalg.norm(attributes, axis=1).astype(np.float32)
-
-    def _motion(self) -> NDArray[np.float32]:
-        places = np.stack([self.playback.means(t) for t in np.linspace(0, 1, _TIMES)])
-        return np.linalg.norm(places - places.mean(axis=0), axis=2).max(axis=0).astype(np.float32)
+    def _motion(self) -> tuple[DeviceArray, float]:
+        """Return how far each Gaussian moves as its color (N, 3), and the distance at the end of the scale."""
+        if self._moved is None:
+            places = np.stack([self.playback.means(t) for t in np.linspace(0, 1, _TIMES)])
+            moved = np.linalg.norm(places - places.mean(axis=0), axis=2).max(axis=0).astype(np.float32)
+            array = self._pool.upload("motion", np.repeat(moved[:, None], 3, axis=1))
+            self._moved = array, max(float(np.percentile(moved, 98)) if len(moved) else 1.0, 1e-9)
+        return self._moved

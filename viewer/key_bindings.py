@@ -26,15 +26,12 @@ KEYS = (
     KeyBinding("[", "[", "slower", "play slower"),
     KeyBinding("]", "]", "faster", "play faster"),
     KeyBinding("l", "L", "next_loop", "at the end: loop, bounce or stop"),
-    KeyBinding("m", "M", "next_mode", "what is shown: colors, depth, coverage, motion, dynamics"),
+    KeyBinding("m", "M", "next_mode", "what is shown: colors, depth, coverage, motion"),
     KeyBinding("b", "B", "next_background", "background: black, white or grey"),
     KeyBinding("x", "X", "antialiased", "antialiased or not (Mip-Splatting's filter)"),
     KeyBinding("f", "F", "focus", "turn about what lies under the pointer (a double click does the same)"),
     KeyBinding("r", "R", "reset_camera", "camera back to where it started"),
-    KeyBinding("v", "V", "flying", "fly: W A S D move, Q E down and up, Shift fast, Alt slow"),
     KeyBinding("n", "N", "next_view", "stand at the capture's next camera, at its time"),
-    KeyBinding("p", "P", "toggle_pause", "pause a training that is watched, or let it go on"),
-    KeyBinding("s", "S", "step_training", "one step of a training, then pause"),
     KeyBinding("o", "O", "show_overlay", "frames a second, milliseconds, splats, adapter"),
     KeyBinding("t", "T", "show_transport", "the time slider"),
     KeyBinding("h", "H", "show_panels", "all panels"),
@@ -46,5 +43,3 @@ MOUSE = (
     ("wheel", "nearer or farther"),
     ("double click", "turn about what lies there"),
 )
-# Direction of a flight: right, down, ahead.
-FLY = {"w": (0, 0, 1), "s": (0, 0, -1), "a": (-1, 0, 0), "d": (1, 0, 0), "q": (0, 1, 0), "e": (0, -1, 0)}

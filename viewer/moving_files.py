@@ -76,9 +76,6 @@ class SampledPlayback:
     def means(self, t: float) -> Floats:
         return self._sample(t).means
 
-    def dynamics(self) -> None:
-        return None
-
     def snapshot(self, t: float) -> GaussianSnapshot:
         now = self._sample(t)
         inside = np.clip(now.opacities.astype(np.float64), 1e-7, 1 - 1e-7)

@@ -24,10 +24,8 @@ class RemoteCanvas(HttpRenderCanvas):
         if kind == "resize":
             self._sizes[id] = dict(event)
         super()._on_event(event, id)
-        if self._active_client != driver:  # another one drives, in a window of another size
-            self.submit_event({"event_type": "pointer_leave"})  # lets go of keys that the former one held
-            if self._active_client in self._sizes:
-                super()._on_event(dict(self._sizes[self._active_client]), self._active_client)
+        if self._active_client != driver and self._active_client in self._sizes:  # another one, with another window
+            super()._on_event(dict(self._sizes[self._active_client]), self._active_client)
 
     def _maybe_draw(self) -> None:
         """Also sends a picture later that could not be sent when it was made, since two were on their way: often it is

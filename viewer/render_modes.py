@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import Literal
 
-Mode = Literal["rgb", "depth", "alpha", "motion", "dynamics"]
+Mode = Literal["rgb", "depth", "alpha", "motion"]
 MODES: dict[Mode, str] = {
     "rgb": "colors",
     "depth": "depth along the camera axis, world units",
     "alpha": "opacity of the image",
     "motion": "largest distance of each Gaussian from its mean position over the clip, world units",
-    "dynamics": "norm of each Gaussian's dynamics attribute",
 }
 # Axis that points up -> the one along which the guessed camera looks.
 AHEAD = {"x": "y", "y": "-z", "z": "y", "-x": "y", "-y": "z", "-z": "y"}

@@ -20,8 +20,8 @@ from lapgs_wgpu.motion.fields.config import MIN_SCALE
 from lapgs_wgpu.splat.drawing import sh_defines
 from lapgs_wgpu.splat.raster_config import gpu_config
 from lapgs_wgpu.viewer.clock import LOOPS, SPEEDS
-from lapgs_wgpu.viewer.controls import FLY_REACH, LOOK, ORBIT, ZOOM
-from lapgs_wgpu.viewer.key_bindings import FLY, KEYS, MOUSE, KeyBinding
+from lapgs_wgpu.viewer.controls import ORBIT, ZOOM
+from lapgs_wgpu.viewer.key_bindings import KEYS, MOUSE, KeyBinding
 from lapgs_wgpu.viewer.render_modes import BACKGROUNDS
 from lapgs_wgpu.viewer.viewport import SETTLED, SMALLEST_SCALE, TARGET_SECONDS
 
@@ -57,7 +57,7 @@ PASSES: dict[str, tuple[str, Defines]] = {
 }  # fmt: skip
 _FIELD = ("hashgrid_slice", "hashgrid SLICED", "hashgrid")  # beside one of deform
 _CHOSEN = ("color", "rasterize", "deform")  # one of each
-_DESKTOP_ACTIONS = ("next_mode", "next_view", "toggle_pause", "step_training")
+_DESKTOP_ACTIONS = ("next_mode", "next_view")
 
 
 def player_data() -> dict[str, Any]:
@@ -77,11 +77,8 @@ def player_data() -> dict[str, Any]:
         "minScale": MIN_SCALE,
         "controls": {
             "keys": {key.key: key.action for key in page_keys()},
-            "fly": FLY,
             "orbit": ORBIT,
-            "look": LOOK,
             "zoom": ZOOM,
-            "reach": FLY_REACH,
         },
         "viewport": {"settled": SETTLED, "target": TARGET_SECONDS, "smallest": SMALLEST_SCALE},
         "loops": LOOPS,
@@ -142,7 +139,7 @@ def page_html(scene: bytes, title: str, poster: NDArray[np.uint8], *, narrowest:
 
 
 def page_keys() -> list[KeyBinding]:
-    """The keys of lapgs-view that a page has a use for: it shows no capture and no training."""
+    """The keys of lapgs-view that a page has a use for: it shows no capture."""
     return [key for key in KEYS if key.action not in _DESKTOP_ACTIONS]
 
 

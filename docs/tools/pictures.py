@@ -34,7 +34,7 @@ FIRST = 24  # frame of the moving picture, all that some programs show: not at t
 SWING = math.radians(40)  # of the camera, to each side
 DISTANCE = 1.1  # in distances from which the viewer begins
 MOST_BYTES = 2_000_000  # of the moving picture
-MODES: tuple[Mode, ...] = ("rgb", "depth", "motion", "dynamics")
+MODES: tuple[Mode, ...] = ("rgb", "depth", "motion")
 WINDOW = (1000, 640)
 
 

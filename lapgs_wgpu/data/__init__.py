@@ -1,4 +1,4 @@
-"""Captures: readers of their formats, one pipeline that makes a dataset of what they return, and built-in scenes."""
+"""Captures: readers of their formats, one pipeline that makes a dataset of what they return, and the built-in scene."""
 
 from __future__ import annotations
 

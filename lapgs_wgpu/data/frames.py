@@ -38,7 +38,7 @@ class Frame:
     split: None to apply the rule for own footage (`split.held_out`), for all frames of a capture or for none.
     label: suffix of the view's name; None to number the views.
     depths: nearest and furthest depth, the capture's units.
-    mask: image, of any size, of what the training leaves out or the masked metrics measure, as mask_kind says.
+    mask: image, of any size, of what the training leaves out, in the color that mask_kind says.
     moving: the same of what moves, white.
     """
 
@@ -52,7 +52,7 @@ class Frame:
     label: str | None = None
     depths: tuple[float, float] | None = None
     mask: Path | None = None
-    mask_kind: MaskKind = "measured"
+    mask_kind: MaskKind = "white"
     moving: Path | None = None
     states_size: bool = True
 

@@ -15,7 +15,7 @@ from typing import get_args
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import SUFFIXES, Pixels, Size, shrink, shrunk_size
 from lapgs_wgpu.data.lens import Lens, Undistortion
-from lapgs_wgpu.data.masks import MASKED, MOSTLY, Mask, MaskKind, check_masks, find_masks, read_mask
+from lapgs_wgpu.data.masks import MOSTLY, Mask, MaskKind, check_masks, find_masks, read_mask
 from lapgs_wgpu.data.mover_cube import mover_cube
 from lapgs_wgpu.data.placement import place
 from lapgs_wgpu.data.readers import apps, colmap, hypernerf, panoptic, poses_bounds, transforms
@@ -38,7 +38,6 @@ def load_dataset(
     folder: str | Path,
     *,
     image_size: int | None = None,
-    normalize: bool = True,
     undistort: bool = True,
     masks: str | Path | None = None,
     movers: str | Path | None = None,
@@ -48,7 +47,6 @@ def load_dataset(
     Args:
         folder: of the capture.
         image_size: longer side in pixels, 1 or more, to which larger images are shrunk; None keeps their size.
-        normalize: False keeps the coordinates of a D-NeRF scene of any size; other formats are always normalized.
         undistort: False takes images as they are, and cameras as pinholes that look at the center of the image,
             whatever the files say of distortion, skew and principal point, as published code on HyperNeRF does.
         masks: folder with a PNG for each training image, under its name, white where the training loss ignores it.
@@ -90,7 +88,7 @@ def load_dataset(
         seen = [(c, _view(frame, 0, c, undistortions[frame.lens]).moving) for c, frame in by_time]
         moving = mover_cube(capture.cloud, [(camera, mask) for camera, mask in seen if mask is not None])
     trained = [frame for _, frame in training]
-    placement = place(capture, trained, training_cameras, normalize=normalize, moving=moving)
+    placement = place(capture, trained, training_cameras, moving=moving)
     warnings += placement.warnings
     summary = _summary(reader.name, capture, cameras, time_source)
 
@@ -215,7 +213,7 @@ def _masked(frames: Sequence[Frame], masks: Path | None, movers: Path | None) ->
 def _check_masks(frames: Sequence[Frame]) -> list[str]:
     size, warnings = frames[0].image.size, list[str]()
     for kind in get_args(MaskKind):
-        of_kind = [frame for frame in frames if frame.mask_kind == kind and frame.split == MASKED[kind]]
+        of_kind = [frame for frame in frames if frame.mask_kind == kind and frame.split == "train"]
         warnings += check_masks({f.name.file: f.mask for f in of_kind if f.mask is not None}, size, kind)
     moving = {frame.name.file: frame.moving for frame in frames if frame.moving is not None}
     return warnings + check_masks(moving, size, "white", movers=True)
@@ -258,15 +256,13 @@ def _view(frame: Frame, number: int, camera: Camera, undistortion: Undistortion 
     def mask(path: Path | None, kind: MaskKind, above: int = 0) -> Callable[[], Mask] | None:
         return None if path is None else partial(read_mask, path, kind, undistortion, stored, size, above)
 
-    used = mask(frame.mask, frame.mask_kind) if frame.split == MASKED[frame.mask_kind] else None
     return View(
         name=f"{frame.split}_{frame.label or f'{number:05d}'}",
         camera=camera,
         time=frame.time,
         source=str(frame.image),
         pixels=pixels,
-        mask=used if frame.split == "test" else None,
-        ignored=used if frame.split == "train" else None,
+        ignored=mask(frame.mask, frame.mask_kind) if frame.split == "train" else None,
         moving=mask(frame.moving, "white", MOSTLY),
     )
 

@@ -1,13 +1,12 @@
 """Masks of images: files found by the images' names, checked when a capture is opened, decoded view by view.
 
-Masks of training images say which pixels the loss ignores. They are white in masks of a user's own, and black in those
-that a capture names itself (nerfstudio's `mask_path`). Masks of test images say which pixels the masked metrics
-measure: DyCheck's covisibility masks (Gao et al. 2022), white where enough training images show a point.
+They say which pixels of training images the loss ignores, white in masks of a user's own and black in those that a
+capture names itself (nerfstudio's `mask_path`); or what moves, white.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
@@ -21,11 +20,9 @@ from lapgs_wgpu.data.lens import Undistortion
 from lapgs_wgpu.errors import InputError
 
 Mask = NDArray[np.bool_]
-MaskKind = Literal["white", "black", "measured"]  # white or black pixels are ignored in training; white ones measured
-MASKED = {"white": "train", "black": "train", "measured": "test"}  # the split whose masks are of this kind
+MaskKind = Literal["white", "black"]  # pixels that are set
 
 WHITE = 128  # level from which on a pixel is set
-MEASURED = 255  # level of a pixel that the masked metrics measure: what mixes with others does not count
 MOSTLY = 127  # level of a shrunk mask, above which most of the pixels mixed there are set
 CHECKED = 8  # masks that are decoded when a capture is opened
 
@@ -49,23 +46,6 @@ def find_masks(folder: Path, names: Iterable[str], what: str) -> dict[str, Path]
     return masks
 
 
-def find_covisible(folders: Sequence[Path], names: Sequence[str]) -> dict[str, Path]:
-    """Find the masks of all these test images in the first folder that holds any; {} if none does.
-
-    Raises InputError if a folder holds only some of them.
-    """
-    for folder in folders:
-        masks, missing = _found(folder, names)
-        if masks and missing:
-            raise InputError(
-                f"{folder / missing[0]}.png does not exist, but {len(masks)} of {len(names)} test images have a mask "
-                f"there; add it, or remove {folder}."
-            )
-        if masks:
-            return masks
-    return {}
-
-
 def _found(folder: Path, names: Iterable[str]) -> tuple[dict[str, Path], list[str]]:
     """The masks below a folder by image, and the images without. Names may differ as in `CaptureFiles.find`."""
     files = CaptureFiles(folder)
@@ -86,24 +66,16 @@ def check_mask_size(path: Path, size: Size) -> None:
 
 
 def check_masks(masks: Mapping[str, Path], size: Size, kind: MaskKind, *, movers: bool = False) -> list[str]:
-    """Check the proportions of masks for images of (width, height) `size`, and decode some of those of training images.
+    """Check the proportions of masks for images of (width, height) `size`, and decode some of them.
 
     masks: by image. movers: whether they say what moves, white. Returns a warning if these take out nothing. Raises
     InputError for other proportions, or if they take out everything.
     """
     for path in masks.values():
         check_mask_size(path, size)
-    if kind == "measured":
-        for path in masks.values():
-            if _levels(decode(path)).max() < MEASURED:
-                raise InputError(
-                    f"{path} has no white pixel ({MEASURED}), which leaves nothing to measure; make it again, or "
-                    "remove the masks of all test images."
-                )
-        return []
     checked = evenly(list(masks.values()), CHECKED)
     levels = [_levels(decode(path)) for path in checked]
-    shares = [_taken_out(level, kind).mean() for level in levels]
+    shares = [_set(level, kind).mean() for level in levels]
     if not shares or (max(shares) > 0 and min(shares) < 1):
         return []
     color = f"{'black (a level below' if kind == 'black' else 'white (a level of at least'} {WHITE} of 255)"
@@ -124,17 +96,16 @@ def read_mask(
 ) -> Mask:
     """Decode the mask (H, W) of an image of (width, height) `stored` that is undistorted and shrunk to `size`.
 
-    The mask is first resized to `stored` by nearest neighbours. A pixel in which several mix is ignored if any of them
-    is, and measured if all of them are; `above` as in `MOSTLY`. Raises InputError.
+    The mask is first resized to `stored` by nearest neighbours. A pixel in which several mix is set if any of them is;
+    `above` as in `MOSTLY`. Raises InputError.
     """
-    pixels = resize(as_pixels(_taken_out(_levels(decode(path)), kind)), stored, NEAREST)
-    out = shrink(pixels if undistortion is None else undistortion.apply(pixels), size)[..., 0] > above
-    return ~out if kind == "measured" else out
+    pixels = resize(as_pixels(_set(_levels(decode(path)), kind)), stored, NEAREST)
+    return shrink(pixels if undistortion is None else undistortion.apply(pixels), size)[..., 0] > above
 
 
-def _taken_out(levels: NDArray[np.uint8], kind: MaskKind) -> Mask:
-    """The pixels (H, W) that a mask of these levels takes out of training or measures."""
-    return levels < MEASURED if kind == "measured" else (levels < WHITE) == (kind == "black")
+def _set(levels: NDArray[np.uint8], kind: MaskKind) -> Mask:
+    """The pixels (H, W) that a mask of these levels sets."""
+    return (levels < WHITE) == (kind == "black")
 
 
 def _levels(mask: Pixels) -> NDArray[np.uint8]:

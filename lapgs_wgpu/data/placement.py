@@ -36,7 +36,6 @@ def place(
     training: Sequence[Frame],
     cameras: Sequence[Camera],
     *,
-    normalize: bool,
     moving: Cube | None = None,
 ) -> Placement:
     """Determine the cube that a capture fills, and bring cloud and depths into the world's coordinates.
@@ -45,7 +44,6 @@ def place(
         capture: with or without a cloud.
         training: its training frames.
         cameras: the distinct cameras of these, in the capture's coordinates.
-        normalize: False keeps the coordinates of captures that may keep theirs, whatever their size.
         moving: the cube of what moves, in the capture's coordinates; None for that of the whole scene.
 
     Raises:
@@ -62,7 +60,7 @@ def place(
     cloud = capture.cloud
     if cloud is not None and capture.own_footage:
         cloud = _filled(cloud, cameras)
-    if cube is None or (capture.keeps_coordinates and (cube.fits or not normalize)):
+    if cube is None or (capture.keeps_coordinates and cube.fits):
         return Placement(None, cloud and cloud.rounded, depths, warnings)
     fit = cube.normalization
     return Placement(

@@ -35,8 +35,6 @@ class View:
     source: description of the image for errors: a file, or a video and its frame.
     pixels: decodes the image on each call, from any thread: (height, width, 3) RGB or (height, width, 4) straight (not
         premultiplied) RGBA, uint8. Raises InputError.
-    mask: decodes the mask of the masked metrics of a test view, such as DyCheck's covisibility masks: (height, width)
-        bool. Raises InputError.
     ignored: decodes the pixels of a training view that the loss leaves out: (height, width) bool. Raises InputError.
     moving: decodes the pixels of what moves: (height, width) bool. Raises InputError.
     """
@@ -46,7 +44,6 @@ class View:
     time: float
     source: str
     pixels: Callable[[], NDArray[np.uint8]]
-    mask: Callable[[], NDArray[np.bool_]] | None = None
     ignored: Callable[[], NDArray[np.bool_]] | None = None
     moving: Callable[[], NDArray[np.bool_]] | None = None
 
@@ -61,19 +58,6 @@ class View:
             )
         image.setflags(write=False)
         return image
-
-    def load_mask(self) -> NDArray[np.bool_] | None:
-        """Decode the mask: (H, W) bool, at least one pixel set; None without a mask. Raises InputError."""
-        if self.mask is None:
-            return None
-        mask = self.mask()
-        size = (self.camera.height, self.camera.width)
-        if mask.dtype != np.bool_ or mask.shape != size or not mask.any():
-            raise InputError(
-                f"{self.source}: expected a mask of {size[1]}x{size[0]} pixels, at least one of them set, got an array "
-                f"of {mask.shape} {mask.dtype} with {np.count_nonzero(mask)} set; make the mask again, or remove it."
-            )
-        return mask
 
     def load_ignored(self) -> NDArray[np.bool_] | None:
         """Decode the pixels that the training loss leaves out: (H, W) bool; None for none. Raises InputError."""

@@ -31,7 +31,7 @@ from lapgs_wgpu.train.lpips import SMALLEST, Lpips
 ERROR_GAIN = 4  # of the error pictures
 OFF_PATH = 0.05  # of the median depth: how far beside a view's camera pictures of what moves are drawn, too
 PARTS = ("psnr_moving", "ssim_moving", "psnr_still", "ssim_still", "explained")
-MEASURES = ("psnr", "ssim", "ms_ssim", "lpips", "lpips_unscaled", "masked_psnr", *PARTS)
+MEASURES = ("psnr", "ssim", "ms_ssim", "lpips", "lpips_unscaled", *PARTS)
 NOT_AVAILABLE = "not available"
 
 
@@ -51,7 +51,7 @@ def evaluate(
     are no weights for it.
     Each measure is one of an image, then the mean over the images (of PSNR of the dB): psnr over all channels; ssim,
     that of the loss; ms_ssim; lpips on inputs in [-1, 1], and lpips_unscaled on inputs in [0, 1], as 3DGS's code
-    reports it; masked_psnr, of the pixels of the view's mask. Where masks say what moves: psnr_moving and
+    reports it. Where masks say what moves: psnr_moving and
     ssim_moving inside them, psnr_still and ssim_still outside, explained the share of the moving pixels that are drawn
     as they are (`differing_pixels`); a picture off_NAME.png shows such a view from OFF_PATH to the left and right.
     "not available" stands for what cannot be measured: pictures too small, no weights, no masks, nothing that moves.
@@ -66,7 +66,7 @@ def evaluate(
     for view in views:
         truth, image = _on(color, view), _render(scene, view, color)
         row: dict[str, Any] = {"view": view.name, "time": view.time}
-        row |= _measures(_unit(image), _unit(truth), view.load_mask(), lpips)
+        row |= _measures(_unit(image), _unit(truth), lpips)
         row |= _parts(_unit(image), _unit(truth), None if view.moving is None else view.moving())
         rows.append(row)
         if folder is not None:
@@ -99,19 +99,15 @@ def _render(scene: Scene4D, view: View, color: Tensor) -> NDArray[np.uint8]:
     return to_8_bit(scene.render(view.camera, view.time, color, depth=False).image)
 
 
-def _measures(
-    image: Tensor, truth: Tensor, pixels: NDArray[np.bool_] | None, lpips: Lpips | None
-) -> dict[str, float | str]:
+def _measures(image: Tensor, truth: Tensor, lpips: Lpips | None) -> dict[str, float | str]:
     side = min(image.shape[:2])
     perceptual = lpips if side >= SMALLEST else None
-    mask = None if pixels is None else torch.from_numpy(pixels)
     return {
         "psnr": psnr(image, truth),
         "ssim": float(ssim(image, truth)),
         "ms_ssim": float(ms_ssim(image, truth)) if side >= MS_SSIM_SMALLEST else NOT_AVAILABLE,
         "lpips": perceptual(image, truth) if perceptual else NOT_AVAILABLE,
         "lpips_unscaled": perceptual(image, truth, unscaled=True) if perceptual else NOT_AVAILABLE,
-        "masked_psnr": psnr(image[mask], truth[mask]) if mask is not None else NOT_AVAILABLE,
     }
 
 

@@ -6,11 +6,9 @@ import dataclasses
 from pathlib import Path
 
 from lapgs_wgpu.data import Dataset, load_dataset
-from lapgs_wgpu.data.synthetic import write_synthetic
+from lapgs_wgpu.data.built_in import SYNTHETIC, write_built_in
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.train.config import Config
-
-SYNTHETIC = "synthetic"  # in place of a folder: the built-in scene
 
 
 def resolve_data(config: Config, scenes: Path) -> Config:
@@ -21,18 +19,17 @@ def resolve_data(config: Config, scenes: Path) -> Config:
         raise InputError(
             f"the configuration names no data; give --data DIR (in Python data.path), or take {SYNTHETIC}."
         )
-    folder = write_synthetic(scenes / SYNTHETIC) if path == SYNTHETIC else Path(path)
+    folder = write_built_in(scenes / SYNTHETIC) if path == SYNTHETIC else Path(path)
     masks = str(Path(config.data.masks).resolve()) if config.data.masks else ""
     return dataclasses.replace(config, data=dataclasses.replace(config.data, path=str(folder.resolve()), masks=masks))
 
 
-def open_dataset(config: Config, *, normalize: bool = True) -> Dataset:
-    """The dataset of a configuration whose path is a folder's. normalize: of `load_dataset`. Raises InputError."""
+def open_dataset(config: Config) -> Dataset:
+    """The dataset of a configuration whose path is a folder's. Raises InputError."""
     data = config.data
     return load_dataset(
         data.path,
         image_size=data.size or None,
-        normalize=normalize,
         undistort=data.undistort,
         masks=data.masks or None,
         movers=data.movers or None,

@@ -185,7 +185,7 @@ def write_points(path: Path, points: np.ndarray, colors: np.ndarray | None = Non
 
 
 def bright(image: np.ndarray) -> np.ndarray:
-    """(H, W) bool: what `write_nerfies` makes a mask of."""
+    """(H, W) bool: where an image is bright, of which masks are made."""
     return image.max(axis=2) > 64
 
 
@@ -198,8 +198,7 @@ def write_nerfies(
     principal: tuple[float, float] = (0, 0),
     aspect: float = 1.0,
 ) -> Path:
-    """`count` images, the last one for testing; scene.json moves and scales the scene; rgb/1x and rgb/2x, and
-    covisible/ with masks of what is bright."""
+    """`count` images, the last one for testing; scene.json moves and scales the scene; rgb/1x and rgb/2x."""
     ids = [f"left_{i:06d}" for i in range(count)]
     lens = lens or {}
     files: dict[str, Any] = {
@@ -211,9 +210,6 @@ def write_nerfies(
         for factor in (1, 2):
             small = Image.fromarray(shot.image).resize((WIDTH // factor, HEIGHT // factor), Image.Resampling.BOX)
             Shot(shot.camera, np.asarray(small)).save(folder / f"rgb/{factor}x/{name}.png")
-            if name == ids[-1]:
-                (folder / f"covisible/{factor}x/val").mkdir(parents=True)
-                Image.fromarray(bright(np.asarray(small))).save(folder / f"covisible/{factor}x/val/{name}.png")
         files[f"camera/{name}"] = {
             "orientation": shot.camera.T_cam_world[:3, :3].tolist(),
             "position": shot.camera.position.tolist(),

@@ -86,20 +86,6 @@ def changes_since_without_device(folder: Path) -> Any:
         return changes_since(folder, None, None, None)  # type: ignore[arg-type]
 
 
-SPEC = """
-preset = "tiny"
-seeds = [0, 1]
-[common]
-schedule.steps = 3
-[scenes]
-toys = "toys"
-lego = { folder = "lego", points.box = 1.5 }
-[rows]
-grid4d = { method = "grid4d" }
-no_ncc = { ablate = ["ncc"], scenes = ["toys"], seeds = [0], loss.pyramid = 0.1 }
-"""
-
-
 def with_checksums(data: bytes) -> bytes:
     """A PNG whose chunks have right checksums, so that the damage gets further in."""
     done, at = data[:8], 8

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from raytrace import SAMPLES, Floats, combine, pixel_means, pixel_rays, plane_hits, to_bytes
 
-from lapgs_wgpu.data.raytrace import SAMPLES, Floats, combine, pixel_means, pixel_rays, plane_hits, to_bytes
 from lapgs_wgpu.splat.camera import Camera
 
 ROOM = 2.0  # distance of the walls; half side of the floor, which reaches twice as far to the right

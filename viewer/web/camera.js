@@ -37,30 +37,15 @@ export class ViewCamera {
         this.position = add(this.focus, this.rotation[2], -distance);
     }
 
-    look(right, down) {
-        const { distance } = this;
-        this.turn(-right, -down);
-        this.focus = add(this.position, this.rotation[2], distance);
-    }
-
     // By these parts of the picture's height at the focus.
     pan(right, down) {
         const reach = -2 * this.distance * Math.tan(0.5 * this.fovY);
-        this.shift(add(this.rotation[0].map(x => reach * right * x), this.rotation[1], reach * down));
-    }
-
-    zoom(factor) { this.position = add(this.focus, add(this.position, this.focus, -1), factor); }
-
-    // By these lengths along the camera's axes.
-    fly(right, down, forward) {
-        const [x, y, z] = this.rotation;
-        this.shift(add(add(x.map(value => right * value), y, down), z, forward));
-    }
-
-    shift(by) {
+        const by = add(this.rotation[0].map(x => reach * right * x), this.rotation[1], reach * down);
         this.position = add(this.position, by);
         this.focus = add(this.focus, by);
     }
+
+    zoom(factor) { this.position = add(this.focus, add(this.position, this.focus, -1), factor); }
 
     turn(right, down) {
         const rotation = this.rotation.map(row => turned(row, this.up, right));

@@ -1,13 +1,11 @@
 // Mouse, touch and keyboard on the canvas (viewer/controls.py); numbers and the table of keys travel as data.
 export class Controls {
     // actions: name -> function. wake: something may have changed. signal: ends it.
-    constructor(canvas, state, { keys, fly, orbit, look, zoom, reach }, actions, wake, signal) {
-        Object.assign(this, { canvas, state, fly, orbit, look, zoom, reach, actions, wake });
+    constructor(canvas, state, { keys, orbit, zoom }, actions, wake, signal) {
+        Object.assign(this, { canvas, state, orbit, zoom, actions, wake });
         this.keys = new Map(Object.entries(keys)).set("/", "show_help");
         this.pointer = [0, 0]; // where it was last
         this.pointers = new Map(); // that are down, by number: where each is
-        this.held = new Map(); // keys that fly, and those that say how fast: where each is on the keyboard -> its name
-        this.flying = false;
         this.dragging = null;
         const listen = (name, handler, options) => canvas.addEventListener(name, event => {
             handler.call(this, event);
@@ -20,17 +18,13 @@ export class Controls {
         listen("dblclick", event => this.actions.focus(event.clientX, event.clientY));
         listen("contextmenu", event => event.preventDefault());
         addEventListener("keydown", event => this.keyDown(event), { signal });
-        // macOS tells of no key that is let go while Command is down.
-        addEventListener("keyup", event => event.key === "Meta" ? this.held.clear() : this.held.delete(event.code), { signal });
-        addEventListener("blur", () => this.held.clear(), { signal });
     }
 
     pointerDown(event) {
         this.canvas.setPointerCapture(event.pointerId);
         this.canvas.focus();
         this.pointers.set(event.pointerId, [event.clientX, event.clientY]);
-        const pan = event.button !== 0 || event.shiftKey;
-        this.dragging = pan ? "pan" : this.flying ? "look" : "orbit";
+        this.dragging = event.button !== 0 || event.shiftKey ? "pan" : "orbit";
     }
 
     pointerMove(event) {
@@ -46,7 +40,6 @@ export class Controls {
             camera.pan(0.5 * right / height, 0.5 * down / height);
             camera.zoom(before / this.spread());
         } else if (this.dragging === "orbit") camera.orbit(this.orbit * right, this.orbit * down);
-        else if (this.dragging === "look") camera.look(this.look * right, this.look * down);
         else camera.pan(right / height, down / height);
     }
 
@@ -64,23 +57,10 @@ export class Controls {
     keyDown(event) {
         if (event.ctrlKey || event.metaKey || event.target.closest?.(event.key === " " ? "select, button" : "select")) return;
         const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
-        if (this.flying && (key in this.fly || key === "Shift" || key === "Alt")) {
-            this.held.set(event.code, key);
-        } else {
-            const action = this.actions[this.keys.get(event.key) ?? this.keys.get(key)];
-            if (!action) return;
-            if (!event.repeat || key === "," || key === ".") action(...this.pointer);
-        }
+        const action = this.actions[this.keys.get(event.key) ?? this.keys.get(key)];
+        if (!action) return;
+        if (!event.repeat || key === "," || key === ".") action(...this.pointer);
         event.preventDefault();
         this.wake();
-    }
-
-    // Move the camera by what the held keys say.
-    advance(seconds) {
-        const held = new Set(this.held.values());
-        const moves = [...held].map(key => this.fly[key]).filter(Boolean);
-        if (!this.flying || !moves.length) return;
-        const far = seconds * this.reach * (held.has("Shift") ? 4 : held.has("Alt") ? 0.25 : 1) * this.state.camera.distance;
-        this.state.camera.fly(...[0, 1, 2].map(axis => far * moves.reduce((sum, move) => sum + move[axis], 0)));
     }
 }

@@ -142,14 +142,13 @@ function start(gpu, { scene, playback, rasterizer }, state, data, reopen) {
         antialiased: () => (state.antialiased = !state.antialiased),
         focus: (x, y) => viewport.focus(x, y).catch(fail),
         reset_camera: () => camera.reset(),
-        flying: () => (controls.flying = !controls.flying),
         show_overlay: () => toggle("overlay"),
         show_transport: () => scene.field && toggle("bar"),
         show_panels: () => toggle("panels"),
         show_help: () => toggle("help"),
     };
     const transport = new Transport(document, state, { actions, wake, signal });
-    const controls = new Controls(canvas, state, data.controls, actions, wake, signal);
+    new Controls(canvas, state, data.controls, actions, wake, signal);
     transport.bar.hidden = !scene.field;
     const address = () => {
         applyAddress(location.hash, { clock, backgrounds: data.backgrounds, setBackground });
@@ -179,7 +178,6 @@ function start(gpu, { scene, playback, rasterizer }, state, data, reopen) {
         const seconds = Math.min(Math.max(now - last, 0) / 1000, LONGEST_STEP); // the first frame may have begun earlier
         last = now;
         try {
-            controls.advance(seconds);
             if (clock.playing) {
                 clock.advance(seconds);
                 wake();

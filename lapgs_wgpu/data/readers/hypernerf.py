@@ -1,8 +1,7 @@
 """Reader of the HyperNeRF format, the layout of nerfies.
 
-scene.json, dataset.json, metadata.json, camera/ID.json and rgb/Nx/ID.png; optional are points.npy, points3D*.ply and
-covisible/Nx/val/ID.png. docs/data.md lists the fields. Cameras and points are returned in the coordinates of
-scene.json: (p - center) scale.
+scene.json, dataset.json, metadata.json, camera/ID.json and rgb/Nx/ID.png; optional are points.npy and points3D*.ply.
+docs/data.md lists the fields. Cameras and points are returned in the coordinates of scene.json: (p - center) scale.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import check_image
 from lapgs_wgpu.data.json_fields import LARGEST_SIDE, Fields, as_fields, kind, matrix, number, read_json
 from lapgs_wgpu.data.lens import Lens
-from lapgs_wgpu.data.masks import find_covisible
 from lapgs_wgpu.data.normalize import Normalization
 from lapgs_wgpu.data.poses import check_rotation, world_to_camera
 from lapgs_wgpu.data.stamps import ImageName
@@ -28,7 +26,6 @@ from lapgs_wgpu.errors import InputError
 CLOUDS = ("points.npy", "points3D_downsample*.ply", "points3D.ply")  # all in the coordinates of the camera files
 TINY = 1e-12  # smaller values count as 0
 STRIDE = 4  # without val_ids: every fourth id from the first on is for training, from the third on for testing
-SPLITS = ("val", "val_intl")  # folders of masks: of DyCheck's captures; of rigs that alternate the training camera
 
 
 def _read(folder: Path, image_size: int | None) -> Capture:
@@ -41,11 +38,8 @@ def _read(folder: Path, image_size: int | None) -> Capture:
         raise InputError(f"{scene.where}: near must be below far, got {depths[0]:g} and {depths[1]:g}.")
     times = _times(_object(folder / "metadata.json"), ids)
     rgb = _image_folder(folder / "rgb", train_ids + test_ids, image_size)
-    files, covisible = CaptureFiles(rgb), folder / "covisible"
-    factors = [covisible / rgb.name, *_factor_folders(covisible)]  # that of the images first, then the smallest
+    files = CaptureFiles(rgb)
     images = {name: files.find_image(f"{name}.png", f"dataset.json names {name}") for name in train_ids + test_ids}
-    tested = [name for name in test_ids if images[name]]
-    masks = find_covisible([factor / split for factor in factors for split in SPLITS], tested)
     splits: list[tuple[Split, list[str]]] = [("train", train_ids), ("test", test_ids)]
     frames = []
     for split, names in splits:
@@ -65,7 +59,6 @@ def _read(folder: Path, image_size: int | None) -> Capture:
                     split=split,
                     label=f"{index:03d}",
                     depths=depths,
-                    mask=masks.get(name),
                 )
             )
     cloud = find_cloud(folder, CLOUDS)

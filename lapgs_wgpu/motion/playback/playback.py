@@ -48,9 +48,6 @@ class Playback(Protocol):
     def means(self, t: float) -> Floats:
         """Return the means (count, 3) at a time, world units."""
 
-    def dynamics(self) -> Floats | None:
-        """Return the dynamics attributes (count, D); None for fields without them."""
-
     def snapshot(self, t: float) -> GaussianSnapshot:
         """Return all Gaussians at a time, as 3DGS viewers read them. `Scene4D.save` writes those at time 0."""
 
@@ -101,9 +98,6 @@ class DevicePlayback:
 
     def means(self, t: float) -> Floats:
         return self.at(t).means.read() if self.moves else self._stored["means"]
-
-    def dynamics(self) -> Floats | None:
-        return self._stored.get("dynamics")
 
     def snapshot(self, t: float) -> GaussianSnapshot:
         now = self.at(t)

@@ -1,4 +1,6 @@
-"""The built-in moving scene: toys over a checkered table, ray traced and written out in the D-NeRF layout.
+"""Renders the built-in moving scene: toys over a checkered table, ray traced and written out in the D-NeRF layout.
+
+python benchmarks/synthetic.py writes it to lapgs_wgpu/data/synthetic.zip, which the package unpacks (data/built_in).
 
 Every toy moves along an ellipse or a line, or turns, at one frequency of its own, so what a trained model should have
 found is known exactly. The scene fits in [-1.3, 1.3]^3, z is up, and the camera jumps about the upper hemisphere from
@@ -11,13 +13,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Literal
+from zipfile import ZipFile, ZipInfo
 
 import numpy as np
+from dnerf_writer import split_times, write_image, write_scene
 from numpy.typing import ArrayLike, NDArray
-
-from lapgs_wgpu.data.dnerf_writer import split_times, write_image, write_scene
-from lapgs_wgpu.data.raytrace import (
+from raytrace import (
     Color,
     Floats,
     Solid,
@@ -29,12 +32,14 @@ from lapgs_wgpu.data.raytrace import (
     to_pixels,
     turn_about_z,
 )
+
+from lapgs_wgpu.data.built_in import RECORD
 from lapgs_wgpu.splat.camera import Camera
 
 CAMERA_ANGLE_X = 0.6911112070083618  # horizontal field of view in radians, that of D-NeRF's scenes
 CAMERA_RADIUS = 4.0
 CAMERA_HEIGHT = (0.3, 0.9)  # range of the sine of the camera's elevation
-RECORD = "synthetic.json"  # the file of the scene's parameters
+PACKED = Path(__file__).parents[1] / "lapgs_wgpu" / "data" / "synthetic.zip"
 VERSION = 1  # of the scene's looks: raise it with every change of what is rendered
 
 TABLE_HEIGHT, TABLE_RADIUS = -0.6, 1.15
@@ -154,3 +159,15 @@ def write_synthetic(
         write_image(unfinished / split / f"{name}.png", render(camera, time))
 
     return write_scene(Path(folder), RECORD, parameters, splits, CAMERA_ANGLE_X, write_frame)
+
+
+def pack(folder: Path, file: Path) -> None:
+    """Write the files of a folder into a zip file, whose bytes depend on nothing else."""
+    with ZipFile(file, "w") as packed:
+        for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+            packed.writestr(ZipInfo(str(path.relative_to(folder))), path.read_bytes())
+
+
+if __name__ == "__main__":
+    with TemporaryDirectory() as made:
+        pack(write_synthetic(Path(made) / "scene"), PACKED)

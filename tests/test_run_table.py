@@ -1,4 +1,4 @@
-"""lapgs-table: what a spec asks for, which runs it trains, and the table of their results."""
+"""benchmarks/run_table: what a spec asks for, which runs it trains, and the table of their results."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import run_table
+from synthetic import write_synthetic
 
-from lapgs_wgpu import command, table, table_cli
+from lapgs_wgpu import command
 from lapgs_wgpu.data import Dataset
-from lapgs_wgpu.data.synthetic import write_synthetic
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.presets import load_config, write_toml
 from lapgs_wgpu.train.run_folder import STATE
@@ -48,12 +49,13 @@ def spec(tmp_path: Path) -> Path:
 
 
 def make(spec: Path, data: Path, *more: str) -> int:
-    return table_cli.table_command([str(spec), "--data", str(data), "--out", str(spec.parent / "out"), *more])
+    arguments = [str(spec), "--data", str(data), "--out", str(spec.parent / "out"), *more]
+    return command.guarded("run_table", run_table.main, arguments)
 
 
 def test_a_spec_names_every_run_with_its_configuration(spec: Path) -> None:
     spec.write_text(SPEC + 'bare = { ablate = ["lap", "dy"], seeds = [3], scenes = ["toys"] }\n')
-    runs = {str(run): run.config for run in table.read_spec(spec)}
+    runs = {str(run): run.config for run in run_table.read_spec(spec)}
     assert list(runs) == [
         "toys, static, seed 3", "toys, static, seed 5", "toys, grid4d, seed 5", "toys, bare, seed 3",
         "others, static, seed 3", "others, static, seed 5",
@@ -69,29 +71,20 @@ def test_a_spec_names_every_run_with_its_configuration(spec: Path) -> None:
 
 @pytest.mark.parametrize("file", sorted((ROOT / "docs" / "tables").glob("*.toml")), ids=lambda file: file.name)
 def test_the_committed_specs_are_valid(file: Path) -> None:
-    assert table.read_spec(file)
+    assert run_table.read_spec(file)
 
 
-MISTAKES = {
-    "unknown key": ("seeds = [3, 5]", "sedes = [3, 5]", "sedes"),
-    "no seeds": ("seeds = [3, 5]\n", "", "seeds"),
-    "unknown key of the configuration": ("width", "widht", "field.widht"),
-    "unknown method": ('method = "grid4d"', 'method = "grid5d"', "rows.grid4d: method"),
-    "unknown part": ('method = "grid4d"', 'ablate = ["lapp"]', "rows.grid4d: ablate"),
-    "unknown scene": ('scenes = ["toys"]', 'scenes = ["toy"]', "rows.grid4d.scenes"),
-    "a scene without a folder": ('folder = "toys"', "points.box = 1", "scenes.others.folder"),
-    "a name that is no folder": ("grid4d = {", '"../up" = {', "'../up'"),
-    "the seed in a row": ('method = "static"', 'method = "static", seed = 1', "rows.static"),
-    "missing folder": ('\ntoys = "toys"', '\ntoys = "toyz"', "toyz"),
-}
-
-
-@pytest.mark.parametrize("name", MISTAKES)
+@pytest.mark.parametrize(
+    ("before", "after", "named"),
+    [
+        ("width", "widht", "field.widht"),
+        ('scenes = ["toys"]', 'scenes = ["toy"]', "rows.grid4d.scenes"),
+        ('\ntoys = "toys"', '\ntoys = "toyz"', "toyz"),
+    ],
+)
 def test_mistakes_end_in_one_sentence_before_any_training(
-    name: str, data: Path, spec: Path, capsys: pytest.CaptureFixture[str]
+    before: str, after: str, named: str, data: Path, spec: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    before, after, named = MISTAKES[name]
-    assert SPEC.count(before) == 1
     spec.write_text(SPEC.replace(before, after))
     assert make(spec, data) == 2
     out, err = capsys.readouterr()
@@ -100,26 +93,19 @@ def test_mistakes_end_in_one_sentence_before_any_training(
     assert not (spec.parent / "out").exists()
 
 
-def test_mistakes_on_the_command_line(data: Path, spec: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for more, named in ((["--device", "GTX 9999"], "GTX 9999"), (["--lpips-weights", "none.safetensors"], "none.safe")):
-        assert make(spec, data, *more) == 2
-        assert named in capsys.readouterr().err
-    assert table_cli.table_command([]) == 2
-
-
 @pytest.fixture
 def trained(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Instead of training, leaves a run folder with made-up figures, and notes here which run it was."""
     done: list[str] = []
 
-    def train(run: table.Run, data: Path, out: Path, *_: object) -> None:
+    def train(run: run_table.Run, data: Path, out: Path, *_: object) -> None:
         done.append(str(run))
-        folder = table.run_folder(out, run)
+        folder = run_table.run_folder(out, run)
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "config.toml").write_text(write_toml(dataclasses.asdict(run.config)))
         (folder / "metrics.json").write_text(json.dumps(metrics(run.seed, run.config.schedule.steps)))
 
-    monkeypatch.setattr(table, "_train", train)
+    monkeypatch.setattr(run_table, "_train", train)
     return done
 
 
@@ -163,37 +149,19 @@ def test_an_interrupted_table_goes_on(
 
         return call
 
-    monkeypatch.setattr(table, "train", interrupted("train"))
-    monkeypatch.setattr(table, "resume", interrupted("resume"))
+    monkeypatch.setattr(run_table, "train", interrupted("train"))
+    monkeypatch.setattr(run_table, "resume", interrupted("resume"))
     assert make(spec, data) == command.INTERRUPTED
     assert "run 1 of 5" in capsys.readouterr().err
     folder = spec.parent / "out" / "toys" / "static" / "seed3"
     folder.mkdir(parents=True)
     (folder / STATE).write_bytes(b"state")
-    (folder / "config.toml").write_text(write_toml(dataclasses.asdict(table.read_spec(spec)[0].config)))
+    (folder / "config.toml").write_text(write_toml(dataclasses.asdict(run_table.read_spec(spec)[0].config)))
     assert make(spec, data) == command.INTERRUPTED
     assert called == [(how, str(data / "toys"), folder) for how in ("train", "resume")]
 
 
-@pytest.mark.nightly
-def test_a_run_that_fails_stops_no_other(data: Path, spec: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Two real runs, of which the first finds a file where its folder should be."""
-    out = spec.parent / "out"
-    out.mkdir()
-    (out / "first").write_text("")
-    text = SPEC[: SPEC.index("[scenes]")].replace("[3, 5]", "[3]")
-    spec.write_text(f'{text}[scenes]\nfirst = "toys"\nsecond = "toys"\n[rows]\nstatic = {{ method = "static" }}\n')
-    assert make(spec, data) == 1
-    shown = capsys.readouterr()
-    assert "first, static, seed 3: " in shown.err
-    assert "| second | static | 1 |" in shown.out
-    measured = json.loads((out / "second/static/seed3/metrics.json").read_text())
-    (only,) = json.loads((out / "results.json").read_text())
-    assert (only["psnr"], only["views"], only["environment"]) == (measured["psnr"], 2, measured["environment"])
-    assert load_config(str(out / "second/static/seed3/config.toml")).data.path == str(data / "toys")
-
-
-def result(scene: str, row: str, seed: int, psnr: float, **more: Any) -> table.Result:
+def result(scene: str, row: str, seed: int, psnr: float, **more: Any) -> run_table.Result:
     return {"scene": scene, "row": row, "seed": seed, **metrics(0, 3), "psnr": psnr, "seconds": 10.0, **more}
 
 
@@ -202,7 +170,7 @@ def test_means_over_the_scenes_weigh_scenes_alike() -> None:
         result("a", "x", 0, 20.0), result("a", "x", 1, 22.0, lpips=0.25), result("a", "x", 2, 24.0),
         result("b", "x", 0, 30.0), result("b", "x", 1, 34.0), result("b", "y", 0, 10.0),
     ]  # fmt: skip
-    lines = table.markdown(results).splitlines()
+    lines = run_table.markdown(results).splitlines()
     assert lines[0] == "| scene | row | seeds | PSNR | ± | SSIM | LPIPS | Gaussians | seconds |"
     assert lines[2] == "| a | x | 3 | 22.00 | 2.00 | 0.5000 | - | 50 | 10 |"
     assert lines[4] == "| b | y | 1 | 10.00 | - | 0.5000 | - | 50 | 10 |"

@@ -1,10 +1,13 @@
-"""Tables of many runs: a preset on several scenes, by rows (methods, or changed keys) and seeds.
+"""Tables of many runs: python benchmarks/run_table.py SPEC.toml --data DIR --out OUT
 
-A run whose folder holds its results is skipped, and an interrupted one is resumed.
+A table has a preset, several scenes, rows (methods, or changed keys) and seeds; docs/tables/demo.toml describes SPEC.
+Each run has its own run folder, OUT/SCENE/ROW/seedN; OUT/results.json has the results of all finished ones. The same
+command again skips what is finished and resumes the run that was interrupted. Exit code 1: a run failed.
 """
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import json
 import re
@@ -16,15 +19,17 @@ from pathlib import Path
 from statistics import mean, stdev
 from typing import Any
 
+from lapgs_wgpu.command import DEVICE_HELP, guarded
+from lapgs_wgpu.data.built_in import SYNTHETIC
 from lapgs_wgpu.errors import DeviceError, InputError, NumericalError, shown
-from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.io.dataclass_table import Options, build_dataclass, checked, option
 from lapgs_wgpu.io.safe_json_toml import read_json, read_toml
 from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.lpips import Lpips
-from lapgs_wgpu.train.open_dataset import SYNTHETIC, open_dataset, resolve_data
+from lapgs_wgpu.train.open_dataset import open_dataset, resolve_data
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run_folder import has_state
 
@@ -226,3 +231,31 @@ def _train(run: Run, data: Path, out: Path, device: Device | None, lpips: Lpips 
         resume(config, dataset, folder, device=device, lpips=lpips)
     else:
         train(config, dataset, folder, device=device, overwrite=True, lpips=lpips)
+
+
+def options() -> argparse.ArgumentParser:
+    """The parser of the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = parser.add_argument
+    add("spec", type=Path, metavar="SPEC.toml", help="definition of the table")
+    add("--data", type=Path, metavar="DIR", default=Path("."), help="folder that contains the scenes' folders [.]")
+    add("--out", type=Path, metavar="OUT", required=True, help="output folder for the runs and results.json")
+    add("--device", metavar="NAME", help=DEVICE_HELP)
+    add("--lpips-weights", type=Path, metavar="FILE", help="also compute LPIPS with the weights in FILE")
+    return parser
+
+
+def main(arguments: list[str]) -> int:
+    """Make the table and print it; returns the exit code."""
+    given = options().parse_args(arguments)
+    runs = read_spec(given.spec)
+    lpips = Lpips(given.lpips_weights) if given.lpips_weights else None
+    failed = make_table(runs, given.data, given.out, device=open_device(given.device), lpips=lpips)
+    print(markdown([result for run in runs if (result := read_result(given.out, run)) is not None]))
+    for run in failed:
+        print(f"{run} failed.", file=sys.stderr)
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(guarded("run_table", main, sys.argv[1:]))
