@@ -16,6 +16,7 @@ from lapgs_wgpu.train_options import parse_options
 
 if typing.TYPE_CHECKING:
     from lapgs_wgpu.data import Dataset
+    from lapgs_wgpu.run import Watch
     from lapgs_wgpu.train.config import Config
     from lapgs_wgpu.train.lpips import Lpips
 
@@ -42,8 +43,14 @@ def _train(arguments: list[str]) -> None:
         _evaluate(Path(options["eval"]), options, overrides)
         return
     lpips = _lpips(options)
+    watch = None
+    if options["view"]:
+        from lapgs_wgpu.viewer import live
+
+        live.check_window()  # before anything is written or replaced
+        watch = live.watch
     if options["resume"]:
-        _resume(Path(options["resume"]), options, overrides, lpips)
+        _resume(Path(options["resume"]), options, overrides, watch, lpips)
         return
     if options["preset"] is None:
         raise InputError("name a preset, such as tiny, and the data to train on; lapgs-train --help says more.")
@@ -57,16 +64,22 @@ def _train(arguments: list[str]) -> None:
     config, dataset = _open_data(config, out.parent)
     if note := rates_that_stay(config, overrides):
         print(f"note: {note}", file=sys.stderr)
-    train(config, dataset, out, device=device, overwrite=overwrite, lpips=lpips)
+    train(config, dataset, out, device=device, overwrite=overwrite, watch=watch, lpips=lpips)
     say(result_text(out))
 
 
-def _resume(run: Path, options: dict[str, typing.Any], overrides: dict[str, typing.Any], lpips: Lpips | None) -> None:
+def _resume(
+    run: Path,
+    options: dict[str, typing.Any],
+    overrides: dict[str, typing.Any],
+    watch: Watch | None,
+    lpips: Lpips | None,
+) -> None:
     from lapgs_wgpu.gpu.device import open_device
     from lapgs_wgpu.run import resume
     from lapgs_wgpu.train.run_folder import changes_since, check_same_data, result_text
 
-    _check_alone("resume", options, [key for key in overrides if key not in RESUME_KEYS])
+    _check_alone("resume", options, [key for key in overrides if key not in RESUME_KEYS], allowed=("view",))
     config = _config_of(run, overrides, "--resume needs the folder of a run")
     device = open_device(options["device"])
     config, dataset = _open_data(config, run.parent)
@@ -74,7 +87,7 @@ def _resume(run: Path, options: dict[str, typing.Any], overrides: dict[str, typi
         check_same_data(run, config.data.path, dataset)
     for what, before, now in changes_since(run, config, device, dataset):
         print(f"lapgs-train: {what} was {before} when {run} began and is {now}: bits may differ.", file=sys.stderr)
-    resume(config, dataset, run, device=device, lpips=lpips)
+    resume(config, dataset, run, device=device, watch=watch, lpips=lpips)
     say(result_text(run))
 
 
@@ -116,11 +129,11 @@ def _evaluate(run: Path, options: dict[str, typing.Any], overrides: dict[str, ty
     say(result_text(run))
 
 
-def _check_alone(option: str, options: dict[str, typing.Any], keys: Sequence[str]) -> None:
+def _check_alone(option: str, options: dict[str, typing.Any], keys: Sequence[str], allowed: Sequence[str] = ()) -> None:
     """Raises InputError where --resume or --eval was given with another option that starts a training, or with keys of
     the configuration."""
-    starting = ("preset", "field", "ablate", "out", "resume", "overwrite")
-    words = [f"--{name}" for name in starting if options[name] and name != option]
+    starting = ("preset", "field", "ablate", "out", "resume", "overwrite", "view")
+    words = [f"--{name}" for name in starting if options[name] and name not in (option, *allowed)]
     for word in [*words, *(f"--{key}" for key in keys)]:
         word = repr(options["preset"]) if word == "--preset" else word
         raise InputError(f"--{option} takes the configuration of the run as it is, so {word} cannot be given.")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from lapgs_wgpu.discovery.start_training import start_training
 from lapgs_wgpu.errors import DeviceError, InputError, NumericalError, quoted
 from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.folder_lock import locked_folder
+from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.progress import Progress, say
@@ -44,6 +46,10 @@ PROBES = 2048  # points of the scene that say whether a camera sees it
 TRAINING_VIEWS = 8  # that are measured during the training where there are no validation views
 OUTSIDE = 0.05  # warn if this share of the Gaussians, or more, is outside the encoder's box
 
+# Takes over a training's steps, such as a viewer does: called with the checkpoint's path, the scene, where to look at
+# it from, and the steps, of which it takes as many as it likes, each one a step. The rest follows when it returns.
+Watch = Callable[[Path, Scene4D, InitialView, Iterator[StepResult]], None]
+
 
 def train(
     config: Config,
@@ -52,6 +58,7 @@ def train(
     *,
     device: Device | None = None,
     overwrite: bool = False,
+    watch: Watch | None = None,
     parts: Parts | None = None,
     lpips: Lpips | None = None,
 ) -> Scene4D:
@@ -59,8 +66,8 @@ def train(
     and eval/ in the folder `out`, which must be new or empty, or hold an earlier run when `overwrite` is set.
 
     device: the default adapter where None. parts: what Python gives the training (docs/api.md). lpips: of the
-    evaluation. The same configuration, pictures, adapter and driver give the same checkpoint to the last byte,
-    interrupted and resumed or not. Raises InputError before anything is written where the input is not usable,
+    evaluation. The same configuration, pictures, adapter and driver give the same checkpoint to the last byte, watched
+    or not, interrupted and resumed or not. Raises InputError before anything is written where the input is not usable,
     and KeyboardInterrupt after Ctrl-C or SIGTERM, when checkpoint and state of the last whole step have been written.
     DeviceError, NumericalError and whatever else ends a step go on to the caller when that state has been written.
     """
@@ -85,7 +92,7 @@ def train(
         if training.discovery is not None:
             say(f"discovery: {training.discovery}; {training.discovery_seconds:.0f} s")
         say(f"steps: {training.steps_are}")
-        return _run(training, out, lpips)
+        return _run(training, out, watch, lpips)
 
 
 def resume(
@@ -94,6 +101,7 @@ def resume(
     out: str | Path,
     *,
     device: Device | None = None,
+    watch: Watch | None = None,
     parts: Parts | None = None,
     lpips: Lpips | None = None,
 ) -> Scene4D:
@@ -121,7 +129,7 @@ def resume(
             except (IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
                 reason = f"{type(error).__name__}: {error}".splitlines()[0]
                 raise InputError(f"{out}: its state and its config.toml do not belong together ({reason}).") from error
-        return _run(training, out, lpips)
+        return _run(training, out, watch, lpips)
 
 
 def _outside(scene: Scene4D) -> str:
@@ -139,7 +147,7 @@ def _outside(scene: Scene4D) -> str:
     )
 
 
-def _run(training: Trainer, out: Path, lpips: Lpips | None) -> Scene4D:
+def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None) -> Scene4D:
     """The steps that are left, with all that a run folder receives."""
     config, scene = training.config, training.scene
     log = Log(out / "log.jsonl", config.schedule.steps, done=training.done, before=training.discovery_seconds)
@@ -151,7 +159,13 @@ def _run(training: Trainer, out: Path, lpips: Lpips | None) -> Scene4D:
             training.callbacks.append(partial(_log_psnr, log))
         if config.schedule.save_interval:
             training.callbacks.append(partial(_save_now_and_then, out))
-        _take_steps(training, out, interrupted)
+        steps = _steps(training, out, interrupted)
+        if watch is not None:
+            watch(out / "checkpoint.ply", scene, training.initial_view, steps)
+        for _ in steps:
+            pass
+        if not training.whole:  # nothing of it may be saved
+            raise RuntimeError(f"step {training.done + 1} broke off halfway, and what watched it kept its error.")
         done, all_steps = training.done, config.schedule.steps
         measured: dict[str, Any] = {"steps": done, "seconds": round(log.seconds, 3)}
         if done == all_steps and (outside := _outside(scene)):
@@ -196,12 +210,12 @@ def _save_now_and_then(out: Path, training: Trainer, result: StepResult) -> None
         save_state(out, training.state())
 
 
-def _take_steps(training: Trainer, out: Path, interrupted: threading.Event) -> None:
+def _steps(training: Trainer, out: Path, interrupted: threading.Event) -> Iterator[StepResult]:
     """Take the steps that are left, until `interrupted` is set. An error saves the state in `out`."""
     last = training.config.schedule.steps
     try:
         while training.done < last and not interrupted.is_set():
-            training.step()
+            yield training.step()
     except (DeviceError, NumericalError, MemoryError) as error:
         kind = MemoryError if not isinstance(error, DeviceError | NumericalError) else type(error)  # numpy has its own
         raise kind(f"{error}{_saved(training, out)}") from error

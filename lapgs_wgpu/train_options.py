@@ -87,9 +87,11 @@ def parse_options(arguments: list[str]) -> dict[str, typing.Any]:
     add("--out", metavar="RUN", help="run folder for all output; must be new or empty, but for --overwrite "
         "[runs/SCENE-PRESET in the current folder; SCENE: name of the capture's folder]")
     add("--resume", metavar="RUN", help="continue the interrupted training in run folder RUN from its last saved "
-        "state. Can be combined with --device, --lpips-weights, --cache-gb, --data (where the capture is now) "
+        "state. Can be combined with --view, --device, --lpips-weights, --cache-gb, --data (where the capture is now) "
         "and --data.masks (where its masks are) only")
     add("--overwrite", action="store_true", help="replace an existing run in the run folder; other files stay")
+    add("--view", action="store_true", help="watch the training in a window; P pauses it, S takes a single step; the "
+        "training goes on when the window is closed")
     add("--device", metavar="NAME", help=DEVICE_HELP)
     add("--list-devices", action="store_true", help=LIST_DEVICES_HELP)
     add("--eval", metavar="RUN", help="evaluate the finished run in folder RUN again; replaces metrics.json "

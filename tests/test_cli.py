@@ -62,6 +62,20 @@ def test_training_writes_a_run_and_prints_its_result(
     assert f'path = "{scene}"' in (tmp_path / "runs" / "toys-tiny" / "config.toml").read_text()
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there is always a display")
+def test_no_run_is_replaced_where_no_window_opens(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("glfw")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "QT_QPA_PLATFORM"):
+        monkeypatch.delenv(name, raising=False)
+    (tmp_path / "checkpoint.ply").write_text("of an earlier run")
+    given = ["tiny", "--data", str(scene), *FAST, "--out", str(tmp_path), "--overwrite", "--view"]
+    assert cli.train_command(given) == 2
+    assert "there is no display): leave out --view" in capsys.readouterr().err
+    assert [child.name for child in tmp_path.iterdir()] == ["checkpoint.ply"]
+
+
 def test_a_runs_configuration_is_a_preset(run: Path, tmp_path: Path) -> None:
     again = tmp_path / "again"
     assert cli.train_command([str(run / "config.toml"), "--out", str(again)]) == 0

@@ -67,6 +67,7 @@ ALLOWED = {
         "train",
         "run",
         "train_options",
+        "viewer",
     },
 }
 FOLDERS = {"": PACKAGE, "viewer": Path(lapgs_wgpu.viewer.__file__).parent}  # where the parts lie on the disk

@@ -59,6 +59,16 @@ def test_a_step_is_adam_at_a_share_of_the_rates_and_at_most_the_highest(share: f
     assert torch.allclose(mlp, weights - share * rates["mlp"] * weights.sign(), atol=1e-7)
 
 
+def test_what_a_step_writes_is_counted() -> None:
+    """By which a viewer sees that a parameter has changed."""
+    gaussians, mlp, optimizer = make()
+    parameters = [*gaussians.values(), mlp]
+    for steps in (range(1, 2), range(2, 3)):
+        versions = [parameter._version for parameter in parameters]
+        run(optimizer, gaussians, mlp, steps, torch.arange(6.0))
+        assert all(parameter._version > before for parameter, before in zip(parameters, versions, strict=True))
+
+
 def test_kept_rows_go_on_as_if_nothing_had_happened() -> None:
     numbers = torch.arange(6.0)
     gaussians, mlp, optimizer = make()

@@ -23,6 +23,7 @@ from lapgs_wgpu.motion.playback.torch_playback import TorchPlayback
 from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.gaussians import Gaussians
+from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 
 TIMES = (0.0, 0.37, 1.0)
@@ -81,7 +82,7 @@ def test_the_still_is_that_of_the_scene(device: Device, tmp_path: Path, name: st
 
 
 @pytest.mark.parametrize("name", ["mlp", "hidden layers"])
-def test_torch_evaluates_another_time_alone(
+def test_torch_evaluates_what_has_changed_alone(
     device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     _, path = saved(device, tmp_path, KINDS[name])
@@ -99,6 +100,34 @@ def test_torch_evaluates_another_time_alone(
         return times == [t]
 
     assert [evaluated(t) for t in (0.1, 0.1, 0.2, 0.1)] == [True, False, True, True]
+    for parameter in (*scene.parameters.values(), *scene.field.parameters()):
+        with torch.no_grad():
+            parameter *= 1
+        assert [evaluated(), evaluated()] == [True, False]
+    for key, parameter in scene.parameters.items():
+        scene.parameters[key] = torch.nn.Parameter(parameter.detach())
+        assert [evaluated(), evaluated()] == [True, False]
+    scene.sh_degree = 1
+    playback.at(0.1)
+    assert len(times) == 1
+
+
+@pytest.mark.kernels
+def test_a_training_can_be_watched(device: Device) -> None:
+    """Parameters, their number and the degree change between calls, and training's own buffers stay as they are."""
+    scene = trained(device, OURS, 50)
+    playback = TorchPlayback(scene)
+    before = picture(playback, 0.4)
+    assert np.abs(before - scene.render(CAMERA, 0.4, torch.tensor([0.1, 0.2, 0.3])).image.numpy()).max() < 1e-6
+    assert playback.at(0.4).means.buffer is not rasterizer_of(device).pool.array("input means", (50, 3)).buffer
+    with torch.no_grad():
+        scene.parameters["sh_dc"] += 0.5
+    assert np.abs(picture(playback, 0.4) - before).max() > 0.05
+    for name, parameter in scene.parameters.items():
+        scene.parameters[name] = torch.nn.Parameter(parameter.detach()[:20].clone())
+    scene.sh_degree = 3
+    now = playback.at(0.4)
+    assert (playback.count, len(now), playback.sh_degree, now.sh_degree) == (20, 20, 3, 3)
 
 
 @pytest.mark.kernels

@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
+import asyncio
 import importlib
+import signal
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from helpers.playback import open_playback
 from helpers.still_scenes import CAMERA
-from helpers.trained_scenes import GRID4D, trained
+from helpers.trained_scenes import GRID4D, OURS, trained
 
-from lapgs_wgpu.errors import DeviceLostError
+from lapgs_wgpu.errors import DeviceLostError, NumericalError
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.io.initial_view import InitialView
+from lapgs_wgpu.motion.playback.torch_playback import TorchPlayback
 from lapgs_wgpu.viewer.cli import _start
 from lapgs_wgpu.viewer.frame import Frame, FrameRenderer, FrameRequest
+from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 from lapgs_wgpu.viewer.options import parse_options
+from lapgs_wgpu.viewer.render_modes import Mode
+from lapgs_wgpu.viewer.view_state import TrainingControl
 
 pytestmark = pytest.mark.kernels
 
@@ -126,3 +136,55 @@ def test_a_device_that_fails_ends_the_viewer(device: Device, tmp_path: Path, mon
     canvas.draw()
     assert str(app.failed) == "the device is gone"
     assert ended == [None]
+
+
+@pytest.mark.parametrize("mode", ["motion", "dynamics"])
+def test_the_values_of_a_training_are_those_after_its_last_step(device: Device, mode: Mode) -> None:
+    """Also where the frame is drawn since the camera moves, and not since `refresh` was called."""
+    offscreen = pytest.importorskip("rendercanvas.offscreen")
+    from lapgs_wgpu.viewer.view_state import ViewState
+    from lapgs_wgpu.viewer.viewport import Viewport
+
+    scene = trained(device, OURS, 60)
+    look = InitialView(CAMERA, np.zeros(3), np.array([0.0, 0, 1]), 9)
+    state = ViewState(LoadedScene(None, TorchPlayback(scene), look))
+    state.mode, state.training = mode, TrainingControl()
+    viewport = Viewport(offscreen.RenderCanvas(size=(64, 48), pixel_ratio=1), state)
+    viewport.draw(50.0)
+    with torch.no_grad():  # a step that reorders the Gaussians
+        for parameter in scene.parameters.values():
+            parameter.copy_(parameter.flip(0))
+    state.training.last = SimpleNamespace(step=1, steps=9, psnr=20.0)
+    state.camera.orbit(0.2, 0.0)
+    viewport.draw(51.0)
+    assert viewport.frame is not None
+    fresh = FrameRenderer(TorchPlayback(scene)).draw(viewport.frame.request)
+    np.testing.assert_array_equal(planes(viewport.frame), planes(fresh))
+
+
+def test_an_error_of_a_watched_step_reaches_the_caller(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    offscreen = pytest.importorskip("rendercanvas.offscreen")
+    from lapgs_wgpu.viewer import live
+
+    tasks: list[Callable[[], Coroutine[Any, Any, None]]] = []
+
+    def run() -> None:
+        for task in tasks:
+            with suppress(Exception):  # as rendercanvas logs it
+                asyncio.run(task())
+
+    def steps() -> Iterator[Any]:
+        yield SimpleNamespace(step=1, steps=9, psnr=20.0)
+        raise NumericalError("step 2: the loss is nan.")
+
+    canvas = offscreen.RenderCanvas(size=(64, 48), pixel_ratio=1)
+    loop = SimpleNamespace(add_task=tasks.append, run=run, call_later=lambda seconds, callback: None)
+    monkeypatch.setattr(live.window, "make_canvas", lambda *_: (canvas, loop))
+    interrupt = signal.getsignal(signal.SIGINT)
+    try:
+        initial_view = InitialView(CAMERA, np.zeros(3), np.array([0.0, 0, 1]), 9)
+        with pytest.raises(NumericalError, match="the loss is nan"):
+            live.watch(Path("checkpoint.ply"), trained(device, GRID4D, 20), initial_view, steps())
+    finally:
+        signal.signal(signal.SIGINT, interrupt)
+    assert canvas.get_closed()

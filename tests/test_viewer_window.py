@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import signal
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,13 +15,14 @@ import pytest
 import torch
 from helpers.desktop import Desktop
 from helpers.scene_files import CONFIG
+from helpers.waiting import PATIENCE
 from numpy.typing import NDArray
 from synthetic import write_synthetic
 
 from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView
-from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.train.presets import load_config, write_toml
 
 SIZE = 320
@@ -88,3 +92,29 @@ def test_scrub_and_turn(desktop: Desktop, run: Path) -> None:
     desktop.wait_for(lambda s: changed(s, first), "the scene from elsewhere")
     desktop.events("key", "r")
     desktop.wait_for(lambda s: not changed(s, first), "the first camera again")
+
+
+@pytest.mark.nightly
+def test_a_training_is_watched_paused_and_stepped(desktop: Desktop, run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    training = desktop.start(
+        sys.executable, "-m", "lapgs_wgpu.cli", "demo", "--data", str(run / "data"), "--data.size", "64",
+        "--points.count", "300", "--steps", "100000", "--view", "--out", str(out),
+    )  # fmt: skip
+    first = desktop.wait_for_change(lambda s: s[150:500, 300:700].max() > 20, "the scene")
+    desktop.wait_for_change(lambda s: np.abs(s - first)[150:500, 300:700].max() > 3, "the scene after more steps")
+    desktop.events("mousemove", 500, 600, "key", "p")
+    paused = desktop.wait_for(lambda s: True, "a training at rest")
+    log = (out / "log.jsonl").read_text()
+    time.sleep(3)
+    assert (out / "log.jsonl").read_text() == log
+    desktop.events("key", "s")
+    desktop.wait_for(lambda s: not np.array_equal(s, paused), "one more step")
+    training.send_signal(signal.SIGINT)
+    _, errors = training.communicate(timeout=PATIENCE)
+    assert training.returncode == 130
+    assert "Traceback" not in errors
+    done = int(errors.split("stopped after step ")[1].split()[0])
+    logged = json.loads(log.splitlines()[-1])["step"] if log else 0
+    assert logged <= done <= logged + 52
+    assert int(load(out / "checkpoint.ply").metadata["step"]) == done

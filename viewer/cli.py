@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from lapgs_wgpu.viewer.view_state import ViewState
 
 _SIZE = (1280, 720)  # of a window or picture, where nothing else says it
+_WITHOUT_WINDOW = "take --backend http to look in a browser (also from another machine), or --screenshot FILE.png"
 
 
 def view_command(arguments: Sequence[str] | None = None) -> int:
@@ -68,7 +69,7 @@ def _entry(given: Any) -> Entry | None:
         return open_entry(given.host or "127.0.0.1", 8080 if given.port is None else given.port)
     from lapgs_wgpu.viewer.window import check_window
 
-    check_window()
+    check_window(_WITHOUT_WINDOW)
     return None
 
 

@@ -59,6 +59,10 @@ class FrameRenderer:
         self._pool = BufferPool(playback.device)
         self._moved: tuple[DeviceArray, float] | None = None
 
+    def forget(self) -> None:
+        """Drop what was measured of the scene, because it has changed."""
+        self._values.clear()
+
     def modes(self) -> list[Mode]:
         """List the modes in which this scene has something to show."""
         return [mode for mode in MODES if mode != "motion" or self.playback.moves]

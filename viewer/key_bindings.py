@@ -32,6 +32,8 @@ KEYS = (
     KeyBinding("f", "F", "focus", "turn about what lies under the pointer (a double click does the same)"),
     KeyBinding("r", "R", "reset_camera", "camera back to where it started"),
     KeyBinding("n", "N", "next_view", "stand at the capture's next camera, at its time"),
+    KeyBinding("p", "P", "toggle_pause", "pause a training that is watched, or let it go on"),
+    KeyBinding("s", "S", "step_training", "one step of a training, then pause"),
     KeyBinding("o", "O", "show_overlay", "frames a second, milliseconds, splats, adapter"),
     KeyBinding("t", "T", "show_transport", "the time slider"),
     KeyBinding("h", "H", "show_panels", "all panels"),

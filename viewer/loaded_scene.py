@@ -30,8 +30,8 @@ _FRAMES = 150  # of a clip whose file does not say how many it has
 
 
 class LoadedScene(NamedTuple):
-    """path: where it came from. initial_view: camera, focus, up and frames to begin with. file: its content, None for
-    moving files of others."""
+    """path: where it came from; of a training under way, its checkpoint. initial_view: camera, focus, up and frames to
+    begin with. file: its content, None for a training, and for moving files of others."""
 
     path: Path
     playback: Playback

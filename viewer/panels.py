@@ -12,7 +12,7 @@ from lapgs_wgpu.viewer.clock import LOOPS, SPEEDS
 from lapgs_wgpu.viewer.key_bindings import KEYS, MOUSE
 from lapgs_wgpu.viewer.present import HEAT
 from lapgs_wgpu.viewer.render_modes import BACKGROUNDS, MODES
-from lapgs_wgpu.viewer.view_state import ViewState
+from lapgs_wgpu.viewer.view_state import TrainingControl, ViewState
 from lapgs_wgpu.viewer.viewport import Viewport
 
 T = TypeVar("T")
@@ -107,11 +107,26 @@ class Panels:
         if _button("Help"):
             state.show_help = not state.show_help
         _tip("keys and mouse (?)")
+        if state.training is not None:
+            self._training(state.training)
         if state.views:
             chosen = _choice("camera", state.view, range(len(state.views)), [view.name for view in state.views])
             if chosen is not None and chosen != state.view:
                 state.stand_at(chosen)
         self._end()
+
+    def _training(self, training: TrainingControl) -> None:
+        imgui.separator_text("Training")
+        last = training.last
+        if last is not None:
+            imgui.progress_bar(last.step / last.steps, (-1, 0), f"step {last.step} of {last.steps}")
+            imgui.text(f"{last.psnr:.2f} dB   {self.state.scene.playback.count:,} Gaussians")
+        if _button("Go on" if training.paused else "Pause"):
+            training.toggle_pause()
+        imgui.same_line()
+        if _button("Step"):
+            training.step()
+        _tip("one step of the optimizer, then pause")
 
     # Texts over the picture ------------------------------------------------------------------------------------------
 

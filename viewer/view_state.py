@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from lapgs_wgpu.viewer.capture_views import capture_views
 from lapgs_wgpu.viewer.clock import LOOPS, SPEEDS
@@ -15,17 +15,48 @@ if TYPE_CHECKING:
     from lapgs_wgpu.data import View
 
 
+class TrainingStep(Protocol):
+    """A finished step: its number, the total number of steps, and the PSNR in dB of its view."""
+
+    @property
+    def step(self) -> int: ...
+    @property
+    def steps(self) -> int: ...
+    @property
+    def psnr(self) -> float: ...
+
+
+class TrainingControl:
+    """Pauses a training. last: the last finished step. single: steps that still run although the training is paused."""
+
+    def __init__(self) -> None:
+        self.last: TrainingStep | None = None
+        self.paused = False
+        self.single = 0
+
+    def toggle_pause(self) -> None:
+        """Pause or continue."""
+        self.paused = not self.paused
+
+    def step(self) -> None:
+        """Run one step, then pause."""
+        self.paused = True
+        self.single += 1
+
+
 class ViewState:
     """Panels read and set the attributes; keys call the methods and turn the flags (viewer/key_bindings). Knows no
     window and no GUI.
 
-    view: number of the capture's camera that was chosen last, or None.
+    view: number of the capture's camera that was chosen last, or None. training: the training under way; None where a
+    file is shown.
     """
 
     def __init__(self, scene: LoadedScene) -> None:
         self.mode: Mode = "rgb"
         self.show_panels = self.show_overlay = True
         self.show_help = False
+        self.training: TrainingControl | None = None
         self.scene, self.renderer = scene, FrameRenderer(scene.playback)
         self.camera, self.clock = scene.camera(), scene.clock()
         self.background = scene.background
@@ -84,6 +115,14 @@ class ViewState:
     def next_view(self) -> None:
         if self.views:
             self.stand_at((self.view + 1 if self.view is not None else 0) % len(self.views))
+
+    def toggle_pause(self) -> None:
+        if self.training is not None:
+            self.training.toggle_pause()
+
+    def step_training(self) -> None:
+        if self.training is not None:
+            self.training.step()
 
 
 def _next(choices: Any, present: Any) -> Any:

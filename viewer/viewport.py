@@ -21,7 +21,8 @@ class Viewport:
     """Draws a ViewState onto a canvas.
 
     format: of the canvas's texture. frame: the one on show, None before the first. scale: its resolution, share of
-    the canvas's; 1 is the full one.
+    the canvas's; 1 is the full one. moved_at: when the view last changed, seconds of `time.perf_counter`; `refresh`
+    does not count. stale: the scene has changed since it was drawn.
     """
 
     def __init__(self, canvas: Any, state: ViewState) -> None:
@@ -35,7 +36,8 @@ class Viewport:
         self.frame: Frame | None = None
         self.scale = self._moving_scale = 1.0
         self._drawn: tuple[Any, ...] = ()  # all that the frame depends on
-        self._moved_at = time.perf_counter()  # when the view last changed
+        self.stale = False
+        self.moved_at = time.perf_counter()
         self._times: deque[float] = deque(maxlen=30)
 
     @property
@@ -49,6 +51,11 @@ class Viewport:
         """Whether the frame on show is final: of the full resolution."""
         return self.scale == 1 and self.frame is not None
 
+    def refresh(self) -> None:
+        """Draw again, because the scene itself has changed."""
+        self.stale = True
+        self.canvas.request_draw()
+
     def draw(self, now: float) -> None:
         """Draw the scene where something changed: at a lower resolution while it changes, in full once
         nothing has changed for SETTLED seconds. now: seconds of `time.perf_counter`."""
@@ -58,15 +65,17 @@ class Viewport:
         key = (*_camera_key(full), *shown)
         moving = bool(self._drawn) and key != self._drawn  # not the first frame
         if key != self._drawn:
-            self._moved_at = now
-        elif self.at_rest or now - self._moved_at < SETTLED:
+            self.moved_at = now
+        elif not self.stale and (self.at_rest or now - self.moved_at < SETTLED):
             return
+        if state.training is not None:
+            state.renderer.forget()
         self.scale = self._moving_scale if moving else 1.0
         camera = full
         if self.scale < 1:
             camera = full.resized(max(1, round(self.scale * full.width)), max(1, round(self.scale * full.height)))
         self.frame = state.renderer.draw(FrameRequest(camera, *shown))
-        self._drawn = key
+        self._drawn, self.stale = key, False
         self._times.append(time.perf_counter())
         if moving:
             ideal = self.scale * math.sqrt(TARGET_SECONDS / max(self.frame.seconds, 1e-4))

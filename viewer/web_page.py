@@ -57,7 +57,7 @@ PASSES: dict[str, tuple[str, Defines]] = {
 }  # fmt: skip
 _FIELD = ("hashgrid_slice", "hashgrid SLICED", "hashgrid")  # beside one of deform
 _CHOSEN = ("color", "rasterize", "deform")  # one of each
-_DESKTOP_ACTIONS = ("next_mode", "next_view")
+_DESKTOP_ACTIONS = ("next_mode", "next_view", "toggle_pause", "step_training")
 
 
 def player_data() -> dict[str, Any]:
@@ -139,7 +139,7 @@ def page_html(scene: bytes, title: str, poster: NDArray[np.uint8], *, narrowest:
 
 
 def page_keys() -> list[KeyBinding]:
-    """The keys of lapgs-view that a page has a use for: it shows no capture."""
+    """The keys of lapgs-view that a page has a use for: it shows no capture and no training."""
     return [key for key in KEYS if key.action not in _DESKTOP_ACTIONS]
 
 

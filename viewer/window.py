@@ -6,6 +6,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable
+from typing import Any
 
 from lapgs_wgpu.errors import InputError, pip_install
 from lapgs_wgpu.viewer.app import App
@@ -13,8 +14,8 @@ from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 from lapgs_wgpu.viewer.view_state import ViewState
 
 
-def check_window() -> None:
-    """Raises InputError where no window can be opened here."""
+def check_window(otherwise: str) -> None:
+    """Raises InputError where no window can be opened here. otherwise: what works without one."""
     check_imgui()
     try:
         import glfw
@@ -26,10 +27,7 @@ def check_window() -> None:
             return
     missing = sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     reason = "there is no display" if missing else "glfw finds no display that it can use"
-    raise InputError(
-        f"no window can be opened here ({reason}): take --backend http to look in a browser (also from another "
-        "machine), or --screenshot FILE.png."
-    )
+    raise InputError(f"no window can be opened here ({reason}): {otherwise}.")
 
 
 def check_imgui() -> None:
@@ -50,11 +48,16 @@ def run_window(scene: LoadedScene, size: tuple[int, int], start: Callable[[ViewS
     size: of the picture, logical pixels. start: puts the state of the view as the window begins. Raises InputError as
     `start` does, and DeviceError where the device is lost or full.
     """
-    from rendercanvas.glfw import RenderCanvas, loop
-
-    canvas = RenderCanvas(title=f"{scene.path} - lapgs-view", size=size, update_mode="ondemand", max_fps=60)
+    canvas, loop = make_canvas(f"{scene.path} - lapgs-view", size)
     app = App(canvas, loop, scene)
     start(app.state)
     loop.run()
     if app.failed is not None:
         raise app.failed
+
+
+def make_canvas(title: str, size: tuple[int, int]) -> tuple[Any, Any]:
+    """Make a window that draws on request, and its event loop."""
+    from rendercanvas.glfw import RenderCanvas, loop
+
+    return RenderCanvas(title=title, size=size, update_mode="ondemand", max_fps=60), loop

@@ -74,6 +74,11 @@ class Optimizer:
         for group in self._adam.param_groups:
             group["lr"] = rates[group["name"]]
         self._adam.step()
+        # Fused Adam does not count what it writes, and a viewer knows by the count that it has to look again.
+        for parameters in self.parameters().values():
+            for parameter in parameters:
+                if parameter.grad is not None:
+                    torch.autograd.graph.increment_version(parameter)
 
     def edit_rows(self, rows: Tensor, added: Mapping[str, Tensor] | None = None) -> None:
         """Keep Gaussians with their state, those of a mask (N,) or of indices (M,) in their order, and append new ones.

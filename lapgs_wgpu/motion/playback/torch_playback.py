@@ -1,37 +1,66 @@
-"""Playback of scenes whose field only torch evaluates."""
+"""Playback of scenes that torch evaluates: other fields, and scenes in training."""
 
 from __future__ import annotations
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.io.ply import GaussianSnapshot
 from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.motion.timing import Timing
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import upload_gaussians
 
 
 class TorchPlayback:
-    """A Playback of a Scene4D that does not change. It is evaluated only if the time has changed."""
+    """A Playback of a Scene4D in its present state: parameters, their number and sh_degree may change between calls.
+
+    The scene is evaluated only if the time, the degree or a parameter has changed, according to torch's version
+    counters. Fused optimizers do not increment them by themselves (train/optimizer).
+    """
 
     def __init__(self, scene: Scene4D) -> None:
         self.scene = scene
         self.device, self.field_config, self.metadata = scene.device, scene.field_config, scene.metadata
-        self.count, self.sh_degree, self.timing = len(scene), scene.sh_degree, scene.timing
-        self.moves = scene.field is not None
-        self._pool = BufferPool(scene.device)
-        self._shown: tuple[float, Gaussians[DeviceArray]] | None = None  # of which time, and what
+        self._pool = BufferPool(scene.device)  # a training uses its own
+        self._shown: Gaussians[DeviceArray] | None = None
+        # Time and degree of what is shown, and id and version of each parameter.
+        self._shown_of: tuple[float, int, list[tuple[int, int]]] | None = None
+        self._parameters: list[Tensor] = []  # kept, so that no other tensor has their ids
+
+    @property
+    def count(self) -> int:
+        return len(self.scene)
+
+    @property
+    def timing(self) -> Timing:
+        return self.scene.timing
+
+    @property
+    def sh_degree(self) -> int:
+        return self.scene.sh_degree
+
+    @property
+    def moves(self) -> bool:
+        return self.scene.field is not None
 
     def at(self, t: float) -> Gaussians[DeviceArray]:
-        if self._shown is None or self._shown[0] != t:
+        scene = self.scene
+        parameters: list[Tensor] = list(scene.parameters.values())
+        if scene.field is not None:
+            parameters += scene.field.parameters()
+        wanted = t, scene.sh_degree, [(id(parameter), parameter._version) for parameter in parameters]
+        if self._shown is None or self._shown_of != wanted:
             self._shown = None  # after a failure the buffers would be inconsistent
             with torch.no_grad():
-                now = self.scene.at(t)
-            self._shown = t, upload_gaussians(self._pool, now)
-        return self._shown[1]
+                now = scene.at(t)
+            self._shown = upload_gaussians(self._pool, now)
+            self._shown_of, self._parameters = wanted, parameters
+        return self._shown
 
     def means(self, t: float) -> NDArray[np.float32]:
         with torch.no_grad():

@@ -1,0 +1,90 @@
+"""Shows a training while it runs: `lapgs-train --view`.
+
+Training and window share one thread: the window's loop takes a step of the training at a time and looks after mouse
+and keys in between. A picture of the new state is drawn seldom enough to cost the training little, unless the camera
+or the time moves, when the pictures come first.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import FrameType
+
+from rendercanvas.utils.asyncs import sleep
+
+from lapgs_wgpu.io.initial_view import InitialView
+from lapgs_wgpu.motion.playback.torch_playback import TorchPlayback
+from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.viewer import window
+from lapgs_wgpu.viewer.app import App
+from lapgs_wgpu.viewer.loaded_scene import LoadedScene
+from lapgs_wgpu.viewer.view_state import TrainingControl, TrainingStep
+
+SHARE = 0.02  # of the time may go into pictures while nobody moves anything
+_OPENING = 4.0  # seconds after the first step, in which the window draws what it begins with: shaders are compiled
+_ATTENTION = 0.5  # seconds after a move in which the pictures come first
+_PATIENCE = 0.02  # seconds between looks at mouse and keys while the training rests
+
+
+def check_window() -> None:
+    """Raises InputError where no window can be opened here."""
+    window.check_window("leave out --view")
+
+
+def watch(path: Path, scene: Scene4D, initial_view: InitialView, steps: Iterator[TrainingStep]) -> None:
+    """Show the scene in a window and take the training's steps, until the window is closed.
+
+    path: of the checkpoint, once there is one.
+
+    An error of a step closes the window and goes on to the caller.
+    """
+    canvas, loop = window.make_canvas("training - lapgs-train", (1280, 720))
+    app = App(canvas, loop, LoadedScene(path, TorchPlayback(scene), initial_view))
+    state, viewport = app.state, app.viewport
+    state.training = training = TrainingControl()
+    interrupt = signal.getsignal(signal.SIGINT)
+    failed: list[Exception] = []
+
+    def on_interrupt(signum: int, frame: FrameType | None) -> None:
+        training.paused = False  # the training notices after its next step
+        if callable(interrupt):
+            interrupt(signum, frame)
+
+    async def drive() -> None:
+        signal.signal(signal.SIGINT, on_interrupt)  # in place of the one of the window's loop
+        begun: float | None = None
+        pictured = spent = 0.0  # when the last picture was asked for, and the time that had gone into drawing then
+        while True:
+            moving = not state.clock.playing and time.perf_counter() - viewport.moved_at < _ATTENTION
+            if moving or (training.paused and not training.single):
+                await sleep(_PATIENCE)
+                continue
+            try:
+                progress = next(steps, None)
+            except Exception as error:  # the window's loop would log it and go on
+                failed.append(error)
+                progress = None
+            if progress is None:  # done, or interrupted: what follows must not wait for somebody to close the window
+                canvas.close()
+                return
+            training.last = progress
+            training.single = max(0, training.single - 1)
+            now = time.perf_counter()
+            begun = begun or now
+            if now - begun < _OPENING:
+                pictured, spent = now, app.drawing_seconds
+            if training.paused or (not viewport.stale and now - pictured > (app.drawing_seconds - spent) / SHARE):
+                viewport.refresh()
+                pictured, spent = now, app.drawing_seconds
+            await sleep(0.0)
+
+    loop.add_task(drive)
+    loop.run()
+    if failed:
+        raise failed[0]
+    if app.failed is not None:
+        print(f"the window was closed: {app.failed}", file=sys.stderr)
