@@ -61,7 +61,7 @@ class FrameRenderer:
 
     def forget(self) -> None:
         """Drop what was measured of the scene, because it has changed."""
-        self._values.clear()
+        self._moved = None
 
     def modes(self) -> list[Mode]:
         """List the modes in which this scene has something to show."""

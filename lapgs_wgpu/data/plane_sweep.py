@@ -43,7 +43,7 @@ PATCH = 12  # pixels of a window at about one depth: fewer are chance
 EDGE = 0.05  # difference of two colors across which depths hardly spread
 HELD = 1e3  # weight of believed depths, relative to those of their neighbors
 MOVED = 0.08  # difference of a color from the median from which on something moves there
-MOMENTS = (0.1, 0.3, 0.5, 0.7, 0.9)  # shares of the clip at which a rig's surfaces that move are searched for
+MOMENTS = (0.1, 0.3, 0.5, 0.7, 0.9)  # of a rig's clip, at which what moves is searched for
 FLAT = 1e-8  # product of two variances, below which windows are flat and look like nothing
 
 
@@ -81,10 +81,12 @@ def still_surface(dataset: Dataset) -> Surface | None:
     points, colors = _kept(found)
     text = f"start: {len(points)} points on surfaces, {share:.0%} of the pixels of {len(stills)} cameras"
     if dataset.is_rig:
-        moved = [_moved(dataset, stills, float(time)) for time in np.quantile(dataset.times, MOMENTS)]
-        points, colors = (np.concatenate([own, *each]) for own, each in zip((points, colors), zip(*moved), strict=True))
-        if count := sum(len(each[0]) for each in moved):
-            text += f", and {count} on what moves, at {len(MOMENTS)} times"
+        still = len(points)
+        for time in np.quantile(dataset.times, MOMENTS):
+            more, their_colors = _moved(dataset, stills, float(time))
+            points, colors = np.concatenate([points, more]), np.concatenate([colors, their_colors])
+        if len(points) > still:
+            text += f", and {len(points) - still} on what moves, at {len(MOMENTS)} times"
     say(text)
     return Surface(points, colors, share) if share else None
 

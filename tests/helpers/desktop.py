@@ -91,12 +91,19 @@ class Desktop:
 
     def wait_for(self, true: Callable[[NDArray[np.int32]], bool], what: str) -> NDArray[np.int32]:
         """The screen, once it is as wanted and has come to rest."""
+        return self._wait(true, what, at_rest=True)
+
+    def wait_for_change(self, true: Callable[[NDArray[np.int32]], bool], what: str) -> NDArray[np.int32]:
+        """The screen as soon as it is as wanted, though it may go on changing."""
+        return self._wait(true, what, at_rest=False)
+
+    def _wait(self, true: Callable[[NDArray[np.int32]], bool], what: str, *, at_rest: bool) -> NDArray[np.int32]:
         end = time.monotonic() + PATIENCE
         before = self.picture()
         while time.monotonic() < end:
             time.sleep(0.4)
             now = self.picture()
-            if true(now) and np.array_equal(now, before):
+            if true(now) and (not at_rest or np.array_equal(now, before)):
                 return now
             before = now
         errors = []
