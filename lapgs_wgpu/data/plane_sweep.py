@@ -83,7 +83,7 @@ def still_surface(dataset: Dataset) -> Surface | None:
     if dataset.is_rig:
         still = len(points)
         for time in np.quantile(dataset.times, MOMENTS):
-            more, their_colors = _moved(dataset, stills, float(time))
+            more, their_colors = _moved(dataset, stills, dataset.depths, float(time))
             points, colors = np.concatenate([points, more]), np.concatenate([colors, their_colors])
         if len(points) > still:
             text += f", and {len(points) - still} on what moves, at {len(MOMENTS)} times"
@@ -91,14 +91,14 @@ def still_surface(dataset: Dataset) -> Surface | None:
     return Surface(points, colors, share) if share else None
 
 
-def _moved(dataset: Dataset, stills: list[_Still], time: float) -> tuple[Points, Points]:
-    """Points and colors (N, 3) of the surfaces that differ at a time from what stands still."""
+def _moved(dataset: Dataset, stills: list[_Still], bounds: tuple[float, float], time: float) -> tuple[Points, Points]:
+    """Points and colors (N, 3) of the surfaces that differ at a time from what stands still. bounds: as below."""
     now = _stills(dataset, at=time)
     changes = [np.abs(one.colors - still.colors).mean(axis=2) for one, still in zip(now, stills, strict=True)]
     moved = [_box(change).ravel() > MOVED for change in changes]
     if not any(mask.any() for mask in moved):
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
-    found = _surfaces(now, dataset.depths)
+    found = _surfaces(now, bounds)
     return _kept([(*each[:2], each[2] & mask) for each, mask in zip(found, moved, strict=True)])
 
 
