@@ -143,7 +143,7 @@ def test_a_camera_that_turns_needs_no_depth() -> None:
         pairs.append((R, np.zeros(3)))
         seen.append(at[:, :2] / at[:, 2:] + np.where(np.arange(30) < 20, 0, turn / 4)[:, None])
     total, _ = depth_errors(ray, np.stack(seen), pairs, np.full(3, 5e-4), 1.0)
-    assert total[:20].max() < 1e-6
+    assert total[:20].max() < 1e-3
     assert total[20:].min() > 5
 
 

@@ -128,15 +128,15 @@ def depth_errors(
     and translation from the one to each other. sigma: (k,) noise of `seen`. The inverse depth, from 0 to `most`, is
     fitted robustly. NaN where less than FEWEST images know a place.
     """
-    deep = np.concatenate([ray, np.ones((len(ray), 1))], axis=1)
-    far = np.stack([deep @ R.T for R, _ in relative])  # of a point at infinity
-    move = np.stack([t for _, t in relative])[:, None]
+    deep, seen = np.concatenate([ray, np.ones((len(ray), 1))], axis=1), seen.astype(np.float32)
+    far = np.stack([deep @ R.T for R, _ in relative]).astype(np.float32)  # of a point at infinity
+    move, sigma = np.stack([t for _, t in relative])[:, None].astype(np.float32), sigma.astype(np.float32)
     known: Mask = np.asarray(np.isfinite(seen).all(axis=2))
     seen = np.where(known[..., None], seen, 0.0)
     a = move[..., :2] - seen * move[..., 2:]  # b + inverse depth * a = 0, up to depth
     b = far[..., :2] - seen * far[..., 2:]
     weight = known / sigma[:, None] ** 2
-    inverse, total, error = np.zeros(len(ray)), np.full(len(ray), np.inf), np.zeros(known.shape)
+    inverse, total, error = np.zeros(len(ray), np.float32), np.full(len(ray), np.inf), np.zeros(known.shape)
     for step in range(PASSES + 1):
         if step:
             z = np.maximum(far[..., 2] + inverse * move[..., 2], 1e-3)
