@@ -15,8 +15,7 @@ from lapgs_wgpu.data.images import encode_png
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.capture import prepare
 from lapgs_wgpu.prepare.flow import Motion
-from lapgs_wgpu.prepare.masks import read_masks
-from lapgs_wgpu.prepare.movers import depth_errors, in_mask, rim, without
+from lapgs_wgpu.prepare.movers import depth_errors, in_mask, read_masks, rim, without
 
 pycolmap = pytest.importorskip("pycolmap")
 pytest.importorskip("av")

@@ -12,7 +12,7 @@ from PIL import Image
 
 from lapgs_wgpu.data.images import Size
 from lapgs_wgpu.data.lens import Lens
-from lapgs_wgpu.prepare.masks import Mask
+from lapgs_wgpu.data.masks import Mask
 from lapgs_wgpu.prepare.movers import without
 from lapgs_wgpu.prepare.pan import Pan, rays, solve_pan
 from lapgs_wgpu.prepare.path import path_faults
