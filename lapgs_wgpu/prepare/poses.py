@@ -127,7 +127,8 @@ class Reconstruction:
             for part in parts:
                 part.random_seed = SEED
             options.mapper.min_tri_angle_deg = LEAST_ANGLE
-            options.mapper.track_required_tracks_per_view = 300
+            options.mapper.track_required_tracks_per_view = 150
+            options.mapper.bundle_adjustment.ceres.solver_options.function_tolerance = 1e-4
             if held:
                 adjustment = options.mapper.bundle_adjustment
                 adjustment.refine_focal_length = adjustment.refine_extra_params = False

@@ -22,7 +22,7 @@ from lapgs_wgpu.progress import say
 FOCALS = 1.0, 1.4, 0.7  # times the width, where EXIF says nothing
 PURE, NEARLY = 0.8, 0.6  # share of the verified matches that turning alone explains: a pan; one, if nothing else fits
 GOOD, SHARP = 0.95, 1.5e-3  # the search ends: share of the images, and the mean error in parts of the longer side
-SECONDS, SECONDS_EACH, CORES = 30.0, 1.0, 2  # of the search: for any film, and for each image, on so many cores
+SECONDS, SECONDS_EACH, CORES = 20.0, 0.6, 2  # of the search: for any film, and for each image, on so many cores
 BENT = 0.4  # first radial coefficient of a lens, at most
 PANORAMA = 3000  # points of a pan
 
