@@ -176,7 +176,7 @@ def _without_movers(
     if seen.moving > MUCH and found.pan is None:
         say(f"{seen.moving:.0%} of the image area disagrees with the first cameras: trying the images' rims alone.")
         source.use(without(matches, source.places, dict.fromkeys(source.names, rim()), size))
-        other = search(source, size)
+        other = search(source, size, rival=True)
         if other is not None and len(other.placed) >= FEWEST * len(source.names):
             judged = judge(motion, source.names, other.model)
             limit = min(seen.noise, judged.noise)  # what is nearly rigid fits a wrong reconstruction nearly

@@ -42,10 +42,11 @@ class Found(NamedTuple):
     held: bool = False
 
 
-def search(source: Reconstruction, size: Size) -> Found | None:
+def search(source: Reconstruction, size: Size, *, rival: bool = False) -> Found | None:
     """The cameras that explain most images, then least implausibly, then best. None where no two images fit together.
 
-    source: with verified matches. size: (width, height) of its images.
+    source: with verified matches. size: (width, height) of its images. rival: whether there are other cameras to
+    compare with: then the first result with enough images ends the search.
     """
     pan = solve_pan(source.names, source.places, source.verified(), size, source.prior)
     if pan is not None and pan.explained >= PURE:
@@ -67,7 +68,8 @@ def search(source: Reconstruction, size: Size) -> Found | None:
         longest = max(longest, spent.seconds - started)
         if found is not None and (best is None or _rank(source, found) > _rank(source, best)):
             best = found
-        if best is not None and number and _good(source, best, size):
+        enough = best is not None and len(best.placed) >= GOOD * len(source.names)
+        if best is not None and enough and (rival or (number and _good(best, size))):
             break  # the first one alone may be wrong, and no measure of it tells
         if found is not None:
             rest = max(left + started - spent.seconds, 0) * spent.slower
@@ -148,9 +150,8 @@ def again(source: Reconstruction, found: Found, matches: Match, masks: Mapping[s
     return described(source, model, together=found.together, held=found.held)
 
 
-def _good(source: Reconstruction, found: Found, size: Size) -> bool:
-    enough = len(found.placed) >= GOOD * len(source.names)
-    return enough and not found.faults and found.error < max(1.0, SHARP * max(size))
+def _good(found: Found, size: Size) -> bool:
+    return not found.faults and found.error < max(1.0, SHARP * max(size))
 
 
 def _rank(source: Reconstruction, found: Found) -> tuple[float, float, float]:
