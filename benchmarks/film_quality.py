@@ -1,7 +1,8 @@
-"""Films of DAVIS 2016, trained: python benchmarks/film_quality.py DAVIS CAPTURES STEPS FILM ... prints a table.
+"""Films of DAVIS 2016, trained: python benchmarks/film_quality.py DAVIS CAPTURES STEPS FILM[:SEED] ... prints a table.
 
-CAPTURES/FILM is what lapgs-prepare makes of the film at 24 frames a second. The preset film trains on it with all
-schedules scaled to STEPS, in CAPTURES/runs/FILM, and is measured inside and outside the annotated masks.
+CAPTURES/FILM is what lapgs-prepare makes of the film at 24 frames a second. The preset film trains on it as
+lapgs-prepare --train does, with all schedules scaled to STEPS, in CAPTURES/runs/FILM[:SEED], and is measured inside and
+outside the annotated masks.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from lapgs_wgpu.train.plan import scale_schedule
 from lapgs_wgpu.train.presets import load_config
 
 RATE = 24  # frames a second
-LIMIT = "20000"  # Gaussians
+LIMIT = "24000"  # Gaussians
 
 
 def write_true_masks(annotations: Path, capture: Path) -> Path:
@@ -42,9 +43,10 @@ def main(davis: Path, captures: Path, steps: int, films: list[str]) -> None:
     print("| film | PSNR | SSIM | where it moves | elsewhere | explained | Gaussians | seconds |")
     print("|---|---:|---:|---:|---:|---:|---:|---:|", flush=True)
     device = open_device()
-    for film in films:
-        capture, run, started = captures / film, captures / "runs" / film, time.perf_counter()
-        config = load_config("film", {"data.path": str(capture), "density.limit": LIMIT})
+    for name in films:
+        film, _, seed = name.partition(":")
+        capture, run, started = captures / film, captures / "runs" / name, time.perf_counter()
+        config = load_config("film", {"data.path": str(capture), "density.limit": LIMIT, "seed": seed or "0"})
         config = resolve_data(scale_schedule(config, steps), run)
         if not (run / "metrics.json").exists():
             train(config, open_dataset(config), run, device=device, overwrite=True)
@@ -55,7 +57,7 @@ def main(davis: Path, captures: Path, steps: int, films: list[str]) -> None:
         pairs = zip(found.test, given.test, strict=True)  # the world's coordinates follow the masks that were found
         m = evaluate(scene, [dataclasses.replace(view, moving=other.moving) for view, other in pairs], "black")
         print(
-            f"| {film} | {m['psnr']:.2f} | {m['ssim']:.3f} | {m['psnr_moving']:.2f} | {m['psnr_still']:.2f} | "
+            f"| {name} | {m['psnr']:.2f} | {m['ssim']:.3f} | {m['psnr_moving']:.2f} | {m['psnr_still']:.2f} | "
             f"{m['explained']:.0%} | {m['gaussians']:,} | {seconds:.0f} |",
             flush=True,
         )

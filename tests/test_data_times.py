@@ -120,6 +120,9 @@ def test_transforms_as_other_programs_write_them(named: str, tmp_path: Path) -> 
     if named == "no suffix":
         view = load_dataset(folder, masks=folder / "Mine").train[0]
         np.testing.assert_array_equal(view.load_ignored(), mask == 255)
+        moving = load_dataset(folder, movers="Mine/Images").test[0].moving  # the folder of all images may be missing
+        assert moving is not None
+        np.testing.assert_array_equal(moving(), mask == 255)
 
 
 @pytest.mark.parametrize("form", ["COLMAP", "nerfstudio", "smaller", "D-NeRF"])

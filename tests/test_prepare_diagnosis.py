@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 from pathlib import Path
@@ -140,6 +141,10 @@ def test_still_cameras(tmp_path: Path, seeing: int) -> None:
     assert found.measure("coverage").number == seeing
     assert found.measure("coverage").good is (seeing >= 3)
     assert found.measure("moving share").number > 0.003 * seeing
+    apart = [
+        np.arccos(a @ b) for a, b in itertools.pairwise([c.position / np.linalg.norm(c.position) for c in cameras])
+    ]
+    assert found.measure("spacing").number == pytest.approx(np.degrees(np.median(apart)), rel=0.2)
     assert found.measure("exposure") is None
     assert "4 cameras that stand still" in str(found)
 

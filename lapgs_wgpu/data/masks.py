@@ -47,11 +47,15 @@ def find_masks(folder: Path, names: Iterable[str], what: str) -> dict[str, Path]
 
 
 def _found(folder: Path, names: Iterable[str]) -> tuple[dict[str, Path], list[str]]:
-    """The masks below a folder by image, and the images without. Names may differ as in `CaptureFiles.find`."""
-    files = CaptureFiles(folder)
-    found = {
-        name: files.find(f"{name}.png") or files.find(str(PurePosixPath(name).with_suffix(".png"))) for name in names
-    }
+    """The masks below a folder by image, and the images without. Names may differ as in `CaptureFiles.find`, and lack
+    the folder where all images lie in one."""
+    files, paths = CaptureFiles(folder), {name: PurePosixPath(name) for name in names}
+    one = len({path.parent for path in paths.values()}) == 1
+    found = {}
+    for name, path in paths.items():
+        masks = [PurePosixPath(f"{path}.png"), path.with_suffix(".png")]
+        masks += [PurePosixPath(mask.name) for mask in masks if one]
+        found[name] = next((file for mask in masks if (file := files.find(str(mask)))), None)
     return {name: folder / file for name, file in found.items() if file}, [name for name in found if not found[name]]
 
 

@@ -17,13 +17,12 @@ from lapgs_wgpu.data.readers.colmap import IMAGES, SPARSE
 from lapgs_wgpu.data.timestamps import write_times
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.calibration import match_names, read_calibration
-from lapgs_wgpu.prepare.capture_folder import WORK, RefusedError, appearing
+from lapgs_wgpu.prepare.capture_folder import MASKS, WORK, RefusedError, appearing
 from lapgs_wgpu.prepare.film import Film
 from lapgs_wgpu.prepare.flow import Motion, film_frames
 from lapgs_wgpu.prepare.images import Picture, extract, images_per_second
 from lapgs_wgpu.prepare.inputs import open_inputs
-from lapgs_wgpu.prepare.masks import MASKS, read_masks, write_masks
-from lapgs_wgpu.prepare.movers import cut_out, judge, rim, without
+from lapgs_wgpu.prepare.movers import cut_out, judge, read_masks, rim, without, write_masks
 from lapgs_wgpu.prepare.poses import Floats, Match, Reconstruction, import_cv2, import_pycolmap, neighbouring_pairs
 from lapgs_wgpu.prepare.rig import place_calibrated, place_still
 from lapgs_wgpu.prepare.search import Found, again, described, longest_part, search
@@ -177,7 +176,7 @@ def _without_movers(
     if seen.moving > MUCH and found.pan is None:
         say(f"{seen.moving:.0%} of the image area disagrees with the first cameras: trying the images' rims alone.")
         source.use(without(matches, source.places, dict.fromkeys(source.names, rim()), size))
-        other = search(source, size)
+        other = search(source, size, rival=True)
         if other is not None and len(other.placed) >= FEWEST * len(source.names):
             judged = judge(motion, source.names, other.model)
             limit = min(seen.noise, judged.noise)  # what is nearly rigid fits a wrong reconstruction nearly

@@ -13,9 +13,8 @@ from lapgs_wgpu.data.timestamps import TIMES
 from lapgs_wgpu.errors import InputError, quoted
 from lapgs_wgpu.io.folder_lock import LOCK, locked_folder
 from lapgs_wgpu.io.listing import listed
-from lapgs_wgpu.prepare.masks import MASKS
 
-REPORT = "report.html"
+REPORT, MASKS = "report.html", "masks"
 
 UNFINISHED, WORK, REFUSED = ".unfinished", "work", "refused.txt"
 

@@ -16,8 +16,10 @@ from lapgs_wgpu.data import Dataset, View, load_dataset
 from lapgs_wgpu.data.cloud import in_view, points_in_view
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.images import Pixels
+from lapgs_wgpu.data.masks import Mask
 from lapgs_wgpu.data.readers.colmap import IMAGES
-from lapgs_wgpu.prepare.masks import MASKS, Mask, read_mask
+from lapgs_wgpu.prepare.capture_folder import MASKS
+from lapgs_wgpu.prepare.movers import read_mask
 from lapgs_wgpu.prepare.path import AROUND, STEP, TURN, path_faults
 from lapgs_wgpu.prepare.poses import Floats
 from lapgs_wgpu.progress import Progress
@@ -93,7 +95,7 @@ def diagnose(folder: Path) -> Diagnosis:
     looks = _looks(folder, views, cameras if still else None)
     measures = [parallax(cameras, points), moving_share(looks)]
     if still:
-        measures.append(coverage(looks))
+        measures += [coverage(looks), spacing(cameras, dataset.focus)]
     else:
         measures.append(path(views, points))
         measures.append(exposure(looks, points if dataset.cloud is not None else None))
@@ -194,6 +196,19 @@ def coverage(looks: Sequence[Look]) -> Measure:
     advice = "aim more cameras at what moves: where less than three see it, its place in depth is a guess"
     value = f"{cameras:g} cameras see something move at one time"
     return Measure("coverage", cameras, value, 3, math.inf, "3 or more", advice)
+
+
+def spacing(cameras: Sequence[Camera], focus: Floats) -> Measure:
+    """Of cameras that stand still: the angle between one and the nearest other one, seen from what they look at (3,),
+    the median over them."""
+    rays = np.stack([camera.position - focus for camera in cameras])
+    rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
+    nearest = np.sort(np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1))), axis=1)[:, 1:2]
+    degrees = float(np.median(nearest)) if nearest.size else 0.0
+    advice = "put more cameras between them: so far apart none confirms the depths that another one sees, and views "
+    advice += "between them, such as the held-out one, show blobs"
+    value = f"{degrees:.0f} degrees from a camera to the nearest other one"
+    return Measure("spacing", degrees, value, 0, 30, "30 or less", advice)
 
 
 def exposure(looks: Sequence[Look], points: Floats | None) -> Measure:

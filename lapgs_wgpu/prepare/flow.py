@@ -37,6 +37,7 @@ class Motion:
         self.images: list[Pixels] = []
         self.forth: list[NDArray[np.float16]] = []
         self.back: list[NDArray[np.float16]] = []
+        self._tracks: dict[int, dict[int, Plane]] = {}
         before: Any = None
         forth: Plane | None = None
         back: Plane | None = None
@@ -65,7 +66,9 @@ class Motion:
 
     def tracks(self, image: int) -> dict[int, Plane]:
         """Where the grid of an image is in the images around it, by their offsets; NaN where it is lost."""
-        found = {}
+        if image in self._tracks:
+            return self._tracks[image]
+        found = self._tracks[image] = {}
         for way, there, again in ((1, self.forth, self.back), (-1, self.back, self.forth)):
             at = self.grid
             for offset in range(1, REACH + 1):

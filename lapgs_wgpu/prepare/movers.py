@@ -9,14 +9,15 @@ flow; colors then draw the border (GrabCut: Rother, Kolmogorov, Blake 2004).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.images import Size
+from lapgs_wgpu.data.images import Size, check_image, decode, encode_png
+from lapgs_wgpu.data.masks import WHITE, Mask, check_mask_size, find_masks
 from lapgs_wgpu.prepare.flow import REACH, Motion
-from lapgs_wgpu.prepare.masks import Mask
 from lapgs_wgpu.prepare.poses import Floats, Match, Plane, import_cv2
 
 NOISE, NOISE_GROWS = 0.15, 0.05  # pixels of flow, at least: between neighbouring images; for each further one
@@ -128,15 +129,15 @@ def depth_errors(
     and translation from the one to each other. sigma: (k,) noise of `seen`. The inverse depth, from 0 to `most`, is
     fitted robustly. NaN where less than FEWEST images know a place.
     """
-    deep = np.concatenate([ray, np.ones((len(ray), 1))], axis=1)
-    far = np.stack([deep @ R.T for R, _ in relative])  # of a point at infinity
-    move = np.stack([t for _, t in relative])[:, None]
+    deep, seen = np.concatenate([ray, np.ones((len(ray), 1))], axis=1), seen.astype(np.float32)
+    far = np.stack([deep @ R.T for R, _ in relative]).astype(np.float32)  # of a point at infinity
+    move, sigma = np.stack([t for _, t in relative])[:, None].astype(np.float32), sigma.astype(np.float32)
     known: Mask = np.asarray(np.isfinite(seen).all(axis=2))
     seen = np.where(known[..., None], seen, 0.0)
     a = move[..., :2] - seen * move[..., 2:]  # b + inverse depth * a = 0, up to depth
     b = far[..., :2] - seen * far[..., 2:]
     weight = known / sigma[:, None] ** 2
-    inverse, total, error = np.zeros(len(ray)), np.full(len(ray), np.inf), np.zeros(known.shape)
+    inverse, total, error = np.zeros(len(ray), np.float32), np.full(len(ray), np.inf), np.zeros(known.shape)
     for step in range(PASSES + 1):
         if step:
             z = np.maximum(far[..., 2] + inverse * move[..., 2], 1e-3)
@@ -220,3 +221,26 @@ def in_mask(mask: Mask | None, places: NDArray[np.floating], size: Size) -> Mask
 def rim() -> Mask:
     """Mask of seven tenths of the width and height of an image of any size, whose rim seldom shows what moves."""
     return np.pad(np.ones((42, 42), bool), 9)
+
+
+def write_masks(folder: Path, masks: Mapping[str, Mask]) -> None:
+    """Write PNG images below a folder, white where something moves, under the images' names."""
+    for name, mask in masks.items():
+        path = folder / PurePosixPath(name).with_suffix(".png")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(encode_png(mask.astype(np.uint8) * 255))
+
+
+def read_masks(folder: Path, names: Sequence[str], size: Size) -> dict[str, Mask]:
+    """The masks of images of (width, height), white where something moves, by the images' names, each of which needs
+    one (`find_masks`). Raises InputError."""
+    paths = find_masks(folder, names, "each image in images/ of a first run without --masks, with the same --fps")
+    for path in paths.values():
+        check_mask_size(path, size)
+    return {name: read_mask(path) for name, path in paths.items()}
+
+
+def read_mask(path: Path) -> Mask:
+    """(h, w), white where something moves. Raises InputError."""
+    check_image(path, whole=False)
+    return decode(path)[..., 0] >= WHITE

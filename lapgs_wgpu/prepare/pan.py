@@ -18,7 +18,7 @@ from lapgs_wgpu.prepare.poses import Floats, Match
 MATCHES = 40  # of a pair of images
 SIGMA = 1.5e-3  # of the longer side: residual from which on a match counts little
 CHAINED = 3  # images before one, from which its rotation may be chained
-ITERATIONS, TRIALS = 30, 60
+ITERATIONS, REWEIGHTED = 30, 12
 FIT = 2.5e-3  # of the longer side: a match up to this residual is explained
 FAR = 6  # images apart: near images of a camera that walks look turned, too
 
@@ -90,8 +90,8 @@ def _residuals(s: _Sample, R: Floats, focal: float, radial: float) -> tuple[Floa
 
 
 def _chained(s: _Sample, count: int, focal: float, sigma: float) -> Floats:
-    """(n, 3, 3) rotations, each from an image just before: of many by two matches the one that explains most."""
-    rng = np.random.default_rng(0)
+    """(n, 3, 3) rotations, each from an image just before: the one with the least sum of distances (Kabsch 1976,
+    reweighted)."""
     rotations = np.tile(np.eye(3), (count, 1, 1))
     for image in range(1, count):
         rotations[image] = rotations[image - 1]
@@ -101,20 +101,14 @@ def _chained(s: _Sample, count: int, focal: float, sigma: float) -> Floats:
                 continue
             one, other = (rays(each[both], focal, 0.0) for each in (s.at_a, s.at_b))
             one, other = (each / np.linalg.norm(each, axis=1, keepdims=True) for each in (one, other))
-            pairs = [rng.choice(len(both), 2, replace=False) for _ in range(TRIALS)]
-            turns = np.stack([_turn(one[pair], other[pair]) for pair in pairs])
-            apart = np.linalg.norm(other - one @ turns.transpose(0, 2, 1), axis=2)
-            best = turns[(focal * apart < 3 * sigma).sum(axis=1).argmax()]
-            rotations[image] = best @ rotations[before]
+            turn, weight = np.eye(3), np.ones(len(both))
+            for _ in range(REWEIGHTED):
+                U, _, Vt = np.linalg.svd((weight[:, None] * other).T @ one)
+                turn = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+                weight = 1 / np.maximum(np.linalg.norm(other - one @ turn.T, axis=1), sigma / focal)
+            rotations[image] = turn @ rotations[before]
             break
     return rotations
-
-
-def _turn(one: Floats, other: Floats) -> Floats:
-    """The rotation that takes two directions to two others. Kabsch 1976."""
-    normal = [np.cross(each[0], each[1]) for each in (one, other)]
-    U, _, Vt = np.linalg.svd(other.T @ one + np.outer(normal[1], normal[0]))
-    return U @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt
 
 
 def _refined(s: _Sample, R: Floats, focal: float, sigma: float) -> tuple[Floats, float, float, Floats]:

@@ -24,7 +24,7 @@ NEIGHBOURS = 6  # an image is matched with so many after it, then with ever more
 GROWTH = 1.5
 LEAST_ANGLE = 0.5  # degrees between the rays of a point
 FEWEST_IMAGES, FEWEST_MATCHES = 2, 15  # of a reconstruction; of a pair of images that counts
-SEED = 0
+SEED, TRIALS = 0, 1000  # of RANSAC
 Pair = tuple[str, str]
 Ints = NDArray[np.integer]
 Floats = NDArray[np.float64]
@@ -84,10 +84,13 @@ class Reconstruction:
         with self.database() as database:
             database.clear_matches()
             database.clear_two_view_geometries()
+            for camera in database.read_all_cameras():
+                camera.has_prior_focal_length = self.exif  # the length of an earlier attempt would mislead
+                database.update_camera(camera)
             for (one, other), each in matches.items():
                 database.write_matches(self.ids[one], self.ids[other], each.astype(np.uint32))
         options = colmap.TwoViewGeometryOptions()
-        options.ransac.random_seed = SEED
+        options.ransac.random_seed, options.ransac.max_num_trials = SEED, TRIALS
         options.detect_watermark = False  # what follows the camera is no watermark
         colmap.geometric_verification(self._database, two_view_geometry_options=options)
 
@@ -127,7 +130,8 @@ class Reconstruction:
             for part in parts:
                 part.random_seed = SEED
             options.mapper.min_tri_angle_deg = LEAST_ANGLE
-            options.mapper.track_required_tracks_per_view = 300
+            options.mapper.track_required_tracks_per_view = 150
+            options.mapper.bundle_adjustment.ceres.solver_options.function_tolerance = 1e-4
             if held:
                 adjustment = options.mapper.bundle_adjustment
                 adjustment.refine_focal_length = adjustment.refine_extra_params = False

@@ -14,12 +14,12 @@ from PIL import Image
 from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.images import Pixels, decode
+from lapgs_wgpu.data.masks import Mask
 from lapgs_wgpu.data.readers.colmap import IMAGES
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.prepare.capture_folder import REPORT
 from lapgs_wgpu.prepare.diagnosis import Diagnosis, diagnose
-from lapgs_wgpu.prepare.masks import Mask
 
 IMAGES_SHOWN, WIDTH = 24, 220  # evenly chosen from those that were looked at; pixels of each
 POINTS_DRAWN, DRAWING = 1200, 420  # of the cloud; pixels of the drawing

@@ -12,7 +12,7 @@ from PIL import Image
 
 from lapgs_wgpu.data.images import Size
 from lapgs_wgpu.data.lens import Lens
-from lapgs_wgpu.prepare.masks import Mask
+from lapgs_wgpu.data.masks import Mask
 from lapgs_wgpu.prepare.movers import without
 from lapgs_wgpu.prepare.pan import Pan, rays, solve_pan
 from lapgs_wgpu.prepare.path import path_faults
@@ -22,7 +22,7 @@ from lapgs_wgpu.progress import say
 FOCALS = 1.0, 1.4, 0.7  # times the width, where EXIF says nothing
 PURE, NEARLY = 0.8, 0.6  # share of the verified matches that turning alone explains: a pan; one, if nothing else fits
 GOOD, SHARP = 0.95, 1.5e-3  # the search ends: share of the images, and the mean error in parts of the longer side
-SECONDS, SECONDS_EACH, CORES = 30.0, 1.0, 2  # of the search: for any film, and for each image, on so many cores
+SECONDS, SECONDS_EACH, CORES = 20.0, 0.6, 2  # of the search: for any film, and for each image, on so many cores
 BENT = 0.4  # first radial coefficient of a lens, at most
 PANORAMA = 3000  # points of a pan
 
@@ -42,10 +42,11 @@ class Found(NamedTuple):
     held: bool = False
 
 
-def search(source: Reconstruction, size: Size) -> Found | None:
+def search(source: Reconstruction, size: Size, *, rival: bool = False) -> Found | None:
     """The cameras that explain most images, then least implausibly, then best. None where no two images fit together.
 
-    source: with verified matches. size: (width, height) of its images.
+    source: with verified matches. size: (width, height) of its images. rival: whether there are other cameras to
+    compare with: then the first result with enough images ends the search.
     """
     pan = solve_pan(source.names, source.places, source.verified(), size, source.prior)
     if pan is not None and pan.explained >= PURE:
@@ -67,7 +68,8 @@ def search(source: Reconstruction, size: Size) -> Found | None:
         longest = max(longest, spent.seconds - started)
         if found is not None and (best is None or _rank(source, found) > _rank(source, best)):
             best = found
-        if best is not None and number and _good(source, best, size):
+        enough = best is not None and len(best.placed) >= GOOD * len(source.names)
+        if best is not None and enough and (rival or (number and _good(best, size))):
             break  # the first one alone may be wrong, and no measure of it tells
         if found is not None:
             rest = max(left + started - spent.seconds, 0) * spent.slower
@@ -148,9 +150,8 @@ def again(source: Reconstruction, found: Found, matches: Match, masks: Mapping[s
     return described(source, model, together=found.together, held=found.held)
 
 
-def _good(source: Reconstruction, found: Found, size: Size) -> bool:
-    enough = len(found.placed) >= GOOD * len(source.names)
-    return enough and not found.faults and found.error < max(1.0, SHARP * max(size))
+def _good(found: Found, size: Size) -> bool:
+    return not found.faults and found.error < max(1.0, SHARP * max(size))
 
 
 def _rank(source: Reconstruction, found: Found) -> tuple[float, float, float]:
