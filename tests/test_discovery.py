@@ -10,7 +10,7 @@ import pytest
 import torch
 from motion_scenes import MotionScene, moving_objects, scene_cameras, trace
 from motion_writer import write_motion
-from scipy.spatial.transform import Rotation
+from object_metrics import degrees_beside
 
 from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.data.raytrace import combine, pixel_means
@@ -265,12 +265,6 @@ def seen_turning(turns: float, size: int, count: int) -> tuple[Tracks, list[Resi
     colors, part = np.full((40, 3), 0.5, np.float32), np.zeros(40, np.int64)
     tracks = Tracks(paths[count // 2], colors, part, paths, np.ones(paths.shape[:2], bool))
     return tracks, images, np.stack([box.turn(t) for t in times])
-
-
-def degrees_beside(R: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """(T,) angles between rotations (T, 3, 3), but for one that all of them have in common."""
-    left, _, right = np.linalg.svd((np.swapaxes(R, 1, 2) @ true).sum(axis=0))
-    return np.degrees(Rotation.from_matrix(R @ left @ right @ np.swapaxes(true, 1, 2)).magnitude())
 
 
 @pytest.mark.nightly
