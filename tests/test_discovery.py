@@ -272,9 +272,10 @@ def test_a_part_that_turns_becomes_a_rigid_body(device: Device, monkeypatch: pyt
     monkeypatch.setattr(rigid_fit, "STEPS", 400)
     tracks, images, true = seen_turning(0.8, 48, 40)
     times = np.linspace(0, 1, 40)
-    united, found = find_turns(tracks, times, images)
+    stands, found = find_turns(tracks, times, images)
     assert degrees_beside(found[0], true).mean() < 15
-    rigid, bodies = rigid_fit.rigid_tracks(united, found, times, images, device, torch.Generator().manual_seed(0))
+    generator = torch.Generator().manual_seed(0)
+    rigid, bodies = rigid_fit.rigid_tracks(tracks, stands, found, times, images, device, generator)
     assert bodies == 1
     arms = rigid.paths - rigid.paths.mean(axis=1, keepdims=True)
     left, _, right = np.linalg.svd(np.einsum("tni,nj->tij", arms, arms[20]))
