@@ -283,9 +283,18 @@ def test_a_part_that_turns_becomes_a_rigid_body(device: Device, monkeypatch: pyt
     assert np.ptp(np.linalg.norm(arms, axis=2), axis=0).max() < 1e-3  # it keeps its shape
 
 
-def test_a_part_that_does_not_turn_stays_as_it_is() -> None:
+def test_one_of_the_parts_of_a_thing_stands_for_it_and_it_need_not_turn() -> None:
     tracks, images, _ = seen_turning(0.0, 48, 40)
-    assert not find_turns(tracks, np.linspace(0, 1, 40), images)[1]
+    astray = tracks.paths + (np.arange(40) < 8)[:, None, None].astype(np.float32)
+    both = Tracks(
+        *(np.concatenate([each, each]) for each in tracks[:2]),
+        np.repeat([0, 1], 40),
+        np.concatenate([astray, tracks.paths], axis=1),
+        np.concatenate([tracks.supported, tracks.supported], axis=1),
+    )
+    stands, found = find_turns(both, np.linspace(0, 1, 40), images)
+    assert stands.tolist() == [1, 1]
+    assert not found
 
 
 # The static fit and what it loses ------------------------------------------------------------------------------------
