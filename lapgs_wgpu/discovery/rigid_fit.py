@@ -16,7 +16,7 @@ from torch import Tensor
 
 from lapgs_wgpu.discovery.residual import Residual
 from lapgs_wgpu.discovery.tracks import Tracks, parabolas
-from lapgs_wgpu.discovery.turns import harmonics, part_radius, smoothed_turns
+from lapgs_wgpu.discovery.turns import SPREAD, harmonics, part_radius
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.rasterize import rasterize
 
@@ -28,7 +28,7 @@ SHAPE_FIRST = 60  # steps before bodies are turned and shifted
 RATES = {"points": 2e-3, "colors": 2e-2, "sizes": 1e-2, "opacities": 3e-2, "light": 5e-3, "turns": 1e-2, "shifts": 1e-3}
 LAST = 0.05  # of these rates, in the end; they fall over the second half
 UNEXPLAINED = 0.3  # of what the static fit lacks where a body is: more is left over of what is not rigid
-SPREADS = {"turns": 6.0, "shifts": 2.0}  # time steps; of the weights by which parabolas are fitted around each time
+SPREADS = {"turns": SPREAD, "shifts": 2.0}  # time steps; of the weights by which parabolas are fitted around each time
 
 
 def rigid_tracks(
@@ -48,15 +48,15 @@ def rigid_tracks(
     parts = list(rotations)
     radii = torch.tensor([part_radius(tracks, k) for k in parts])
     others = ~np.isin(stands[tracks.part], parts)
-    near = {name: parabolas(times, np.ones(len(times)), spread) for name, spread in SPREADS.items()}
-    R0 = torch.from_numpy(np.stack([smoothed_turns(rotations[k], near["turns"]) for k in parts], axis=1)).float()
+    R0 = torch.from_numpy(np.stack([rotations[k] for k in parts], axis=1)).float()
     centers = torch.from_numpy(np.stack([tracks.paths[:, tracks.part == k].mean(axis=1) for k in parts], axis=1))
     soft_paths, soft_colors = torch.from_numpy(tracks.paths[:, others]), torch.from_numpy(tracks.colors[others])
     count = len(parts) * POINTS
     points = _sphere(POINTS) * radii[:, None, None]
     size = torch.log(SPACING * (4 * np.pi / POINTS) ** 0.5 * radii)[:, None].repeat(1, POINTS).ravel()
     soft_size = torch.full((int(others.sum()),), float(size.mean()))
-    around = {name: torch.from_numpy(each).float() for name, each in near.items()}
+    weights = {name: parabolas(times, np.ones(len(times)), spread) for name, spread in SPREADS.items()}
+    around = {name: torch.from_numpy(each).float() for name, each in weights.items()}
     values = {
         "points": points,
         "colors": torch.cat([torch.full((count, 3), 0.4), soft_colors]),

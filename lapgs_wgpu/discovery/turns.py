@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from lapgs_wgpu.data.evenly import evenly_indices
 from lapgs_wgpu.discovery.residual import Floats, Residual
-from lapgs_wgpu.discovery.tracks import Tracks
+from lapgs_wgpu.discovery.tracks import Tracks, parabolas
 
 Doubles = NDArray[np.float64]
 
@@ -39,7 +39,8 @@ BLUR = 2.0  # FINE; standard deviation of the weights by which the colors around
 AROUND = (6.0, 2), (2.0, 2), (1.0, 1)  # degrees of a step and number of steps, of the search for the turn of a time
 AS_BEFORE = 18.0  # degrees beside the turn that goes on as before, that weigh as much as all differences of color
 MEMORY = 4  # times by which a turn goes on
-GAIN = 0.15  # share of the colors' variance that the turns of a part must explain, beyond what they do without turns
+SPREAD = 6.0  # time steps; of the weights by which turns become smooth
+GAIN = 0.25  # share of the colors' variance that the turns of a part must explain, beyond what they do without turns
 
 
 class _Look(NamedTuple):
@@ -74,7 +75,7 @@ def find_turns(
         looks = _looks(n, times, np.stack([centers[each] for each in things], axis=1), radii[things], images)
         if sum(len(look.places) > 0 for look in looks) < 2 * max(REACH) + 1:
             continue
-        R = _turns(looks)
+        R = _smoothed(_turns(looks), parabolas(times, np.ones(len(times)), SPREAD))
         colors = np.concatenate([look.colors for look in looks])
         turned, still = (
             _explained(np.concatenate([look.places @ each for look, each in zip(looks, S, strict=True)]), colors)
@@ -218,7 +219,7 @@ def _turn_of(look: _Look, expected: Doubles, sums: Doubles) -> Doubles:
     return best
 
 
-def smoothed_turns(R: Doubles, near: NDArray[np.floating]) -> Doubles:
+def _smoothed(R: Doubles, near: NDArray[np.floating]) -> Doubles:
     """Rotations (T, 3, 3) of which each is the mean of those around, by weights (T, T), as they go on from it."""
     steps = Rotation.from_matrix(R[1:] @ np.swapaxes(R[:-1], 1, 2)).as_rotvec()
     smooth = np.empty_like(R)
