@@ -220,7 +220,7 @@ def turns_and_swaps(paths: Doubles, objects: Sequence[MovingObject], times: Arra
             right.append(0.0)
             continue
         nearest = np.linalg.norm(np.median(own, axis=1)[:, None] - centers, axis=2).argmin(axis=1)
-        swaps += np.count_nonzero(np.diff(nearest))
+        swaps += int(np.count_nonzero(np.diff(nearest)))
         arms = own - own.mean(axis=1, keepdims=True)
         left, _, other = np.linalg.svd(np.einsum("tni,nj->tij", arms, arms[middle]))
         left[:, :, 2] *= np.linalg.det(left @ other)[:, None]  # no mirror images
