@@ -1,6 +1,7 @@
 """How well a run shows the moving objects of a motion scene: python benchmarks/object_metrics.py RUN... prints a
 Markdown table of PSNR, silhouette and displacement of the objects, means over the test views and the objects, from
-images alone. The capture of each RUN is a scene of motion_writer.
+images alone; and by the paths of its Gaussians, how they turn, and how often they change over to another object. The
+capture of each RUN is a scene of motion_writer.
 
 A rendering's silhouette of an object is found by color, so the measure is the same for every representation. A pixel
 is claimed for the object where the rendering
@@ -23,11 +24,14 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from statistics import mean, median
+from typing import NamedTuple
 
 import numpy as np
+from motion_scenes import MotionScene, MovingObject, moving_objects
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from lapgs_wgpu import load, open_device
 from lapgs_wgpu.data.images import check_image
@@ -45,9 +49,13 @@ LEAST_DIFFERENCE = 16.0  # levels of 255, over the channels: less between object
 VISIBLE_PIXELS, VISIBLE_SHARE = 20, 0.25  # least of an object that must be seen: pixels, share of its whole disc
 LEAST_CLAIM = 0.1  # a silhouette of fewer pixels than this share of the true one has no centroid
 FOUND_IOU = 0.5
+TURNED = 3.0  # degrees from the true orientation, up to which one is right
+LEAST_OWN = 4  # Gaussians of an object
+OPAQUE = 0.3  # Gaussians of less opacity tell nothing of an object's pose
 
 Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
+Doubles = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,16 +199,63 @@ def summarise(frames: Sequence[ObjectFrame]) -> tuple[float, float, float]:
     return float(psnr), float(found), float(track)
 
 
-def measure_run(run: Path) -> tuple[float, float, float]:
-    """`summarise` of a finished run on its test views. Raises InputError."""
+def degrees_beside(R: Doubles, true: Doubles) -> Doubles:
+    """(T,) angles between rotations (T, 3, 3), but for one that all of them have in common."""
+    left, _, right = np.linalg.svd((np.swapaxes(R, 1, 2) @ true).sum(axis=0))
+    return np.degrees(Rotation.from_matrix(R @ left @ right @ np.swapaxes(true, 1, 2)).magnitude())
+
+
+def turns_and_swaps(paths: Doubles, objects: Sequence[MovingObject], times: ArrayLike) -> tuple[float, int]:
+    """Share of right orientations, mean over the objects, and how often what belongs to one is nearest to another.
+
+    paths: (T, n, 3) of Gaussians at the times (T,), world units. To an object belong those that are in its bounding
+    sphere at the middle time. Where there are none, no orientation is right.
+    """
+    times = np.asarray(times)
+    centers = np.stack([one.positions(times) for one in objects], axis=1)
+    middle, right, swaps = len(times) // 2, [], 0
+    for n, one in enumerate(objects):
+        own = paths[:, np.linalg.norm(paths[middle] - centers[middle, n], axis=1) < one.reach]
+        if own.shape[1] < LEAST_OWN:
+            right.append(0.0)
+            continue
+        nearest = np.linalg.norm(np.median(own, axis=1)[:, None] - centers, axis=2).argmin(axis=1)
+        swaps += int(np.count_nonzero(np.diff(nearest)))
+        arms = own - own.mean(axis=1, keepdims=True)
+        left, _, other = np.linalg.svd(np.einsum("tni,nj->tij", arms, arms[middle]))
+        left[:, :, 2] *= np.linalg.det(left @ other)[:, None]  # no mirror images
+        true = np.stack([one.turn(t) for t in times])
+        right.append(float((degrees_beside(left @ other, true) <= TURNED).mean()))
+    return mean(right), swaps
+
+
+class Figures(NamedTuple):
+    """`summarise` of a finished run, and `turns_and_swaps`."""
+
+    psnr: float
+    found: float
+    track: float
+    turned: float
+    swaps: int
+
+
+def measure_run(run: Path) -> Figures:
+    """The figures of a finished run on its test views. Raises InputError."""
     config = load_config(run / "config.toml")
     dataset, scene = open_dataset(config), load(run / "checkpoint.ply", open_device())
     color = np.full(3, BACKGROUND_LEVELS[config.data.background], np.float32)
+    folder = Path(config.data.path)
     frames: list[ObjectFrame] = []
-    for view, objects in zip(dataset.test, object_truths(Path(config.data.path), "test", dataset.test), strict=True):
+    for view, objects in zip(dataset.test, object_truths(folder, "test", dataset.test), strict=True):
         image = to_8_bit(scene.render(view.camera, view.time, color.tolist(), depth=False).image)
         frames += measure_objects(image, composite(view.load(), color), objects, color)
-    return summarise(frames)
+    times = np.unique([view.time for view in dataset.test])
+    opaque = scene.at(0.5).opacities.numpy(force=True) >= OPAQUE
+    paths = np.stack([scene.at(float(t)).means.numpy(force=True)[opaque] for t in times])
+    truth = MotionScene(**json.loads((folder / "objects.json").read_text())["scene"])
+    return Figures(
+        *summarise(frames), *turns_and_swaps(paths, [one for one in moving_objects(truth) if one.moves], times)
+    )
 
 
 def _norm(a: Image, b: Image) -> NDArray[np.float64]:
@@ -228,7 +283,8 @@ def _centroid(mask: Mask) -> NDArray[np.float64]:
 
 
 if __name__ == "__main__":
-    print("| run | moving PSNR | found | track |\n|---|---:|---:|---:|")
+    print("| run | moving PSNR | found | track | turned | swaps |\n|---|---:|---:|---:|---:|---:|")
     for run in sys.argv[1:]:
-        psnr, found, track = measure_run(Path(run))
-        print(f"| {run} | {psnr:.2f} | {found:.0%} | {'-' if track == np.inf else f'{track:.2f}'} |")
+        psnr, found, track, turned, swaps = measure_run(Path(run))
+        away = "-" if track == np.inf else f"{track:.2f}"
+        print(f"| {run} | {psnr:.2f} | {found:.0%} | {away} | {turned:.0%} | {swaps} |")

@@ -10,8 +10,8 @@ import pytest
 import torch
 from motion_scenes import MotionScene, moving_objects, scene_cameras, trace
 from motion_writer import write_motion
+from object_metrics import degrees_beside
 from raytrace import combine, pixel_means
-from scipy.spatial.transform import Rotation
 from synthetic import cameras
 
 from lapgs_wgpu.data import Dataset, load_dataset
@@ -267,20 +267,15 @@ def seen_turning(turns: float, size: int, count: int) -> tuple[Tracks, list[Resi
     return tracks, images, np.stack([box.turn(t) for t in times])
 
 
-def degrees_beside(R: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """(T,) angles between rotations (T, 3, 3), but for one that all of them have in common."""
-    left, _, right = np.linalg.svd((np.swapaxes(R, 1, 2) @ true).sum(axis=0))
-    return np.degrees(Rotation.from_matrix(R @ left @ right @ np.swapaxes(true, 1, 2)).magnitude())
-
-
 @pytest.mark.nightly
 def test_a_part_that_turns_becomes_a_rigid_body(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rigid_fit, "STEPS", 400)
     tracks, images, true = seen_turning(0.8, 48, 40)
     times = np.linspace(0, 1, 40)
-    united, found = find_turns(tracks, times, images)
+    stands, found = find_turns(tracks, times, images)
     assert degrees_beside(found[0], true).mean() < 15
-    rigid, bodies = rigid_fit.rigid_tracks(united, found, times, images, device, torch.Generator().manual_seed(0))
+    generator = torch.Generator().manual_seed(0)
+    rigid, bodies = rigid_fit.rigid_tracks(tracks, stands, found, times, images, device, generator)
     assert bodies == 1
     arms = rigid.paths - rigid.paths.mean(axis=1, keepdims=True)
     left, _, right = np.linalg.svd(np.einsum("tni,nj->tij", arms, arms[20]))
@@ -288,9 +283,18 @@ def test_a_part_that_turns_becomes_a_rigid_body(device: Device, monkeypatch: pyt
     assert np.ptp(np.linalg.norm(arms, axis=2), axis=0).max() < 1e-3  # it keeps its shape
 
 
-def test_a_part_that_does_not_turn_stays_as_it_is() -> None:
+def test_one_of_the_parts_of_a_thing_stands_for_it_and_it_need_not_turn() -> None:
     tracks, images, _ = seen_turning(0.0, 48, 40)
-    assert not find_turns(tracks, np.linspace(0, 1, 40), images)[1]
+    astray = tracks.paths + (np.arange(40) < 8)[:, None, None].astype(np.float32)
+    both = Tracks(
+        *(np.concatenate([each, each]) for each in tracks[:2]),
+        np.repeat([0, 1], 40),
+        np.concatenate([astray, tracks.paths], axis=1),
+        np.concatenate([tracks.supported, tracks.supported], axis=1),
+    )
+    stands, found = find_turns(both, np.linspace(0, 1, 40), images)
+    assert stands.tolist() == [1, 1]
+    assert not found
 
 
 # The static fit and what it loses ------------------------------------------------------------------------------------

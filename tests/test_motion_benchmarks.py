@@ -99,9 +99,21 @@ def test_a_run_is_measured(tmp_path: Path, device: Device) -> None:
     train(load_config("tiny", given), load_dataset(folder), tmp_path / "run", device=device)
     record = json.loads((folder / "objects.json").read_text())
     assert [one["moves"] for one in record["objects"]] == [True, True, False]
-    psnr, found, _ = object_metrics.measure_run(tmp_path / "run")
-    assert psnr > 0
-    assert found == 0
+    figures = object_metrics.measure_run(tmp_path / "run")
+    assert figures.psnr > 0
+    assert figures.found == 0
+
+
+def test_turns_and_swaps_are_seen_in_paths() -> None:
+    objects = [one for one in moving_objects(MotionScene(objects="twins", turns=2)) if one.moves]
+    times = np.linspace(0, 1, 21)
+    arms = np.random.default_rng(0).uniform(-0.15, 0.15, (30, 3))
+    turning = [np.stack([arms @ one.turn(t).T for t in times]) + one.positions(times)[:, None] for one in objects]
+    still = [arms + one.positions(times)[:, None] for one in objects]
+    assert object_metrics.turns_and_swaps(np.concatenate(turning, axis=1), objects, times) == (1.0, 0)
+    assert object_metrics.turns_and_swaps(np.concatenate([turning[0], still[1]], axis=1), objects, times)[0] < 0.7
+    swapped = np.concatenate([np.where(times[:, None, None] > 0.8, turning[1 - n], turning[n]) for n in (0, 1)], axis=1)
+    assert object_metrics.turns_and_swaps(swapped, objects, times)[1] == 2
 
 
 def test_pixels_that_move_before_a_still_camera(tmp_path: Path) -> None:

@@ -79,10 +79,9 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
     generator = torch.Generator().manual_seed(config.seed)
     bodies = 0
     if tracks is not None and not sheets:
-        united, turns = find_turns(tracks, times, images)
+        stands, turns = find_turns(tracks, times, images)
         if turns:
-            turned, bodies = rigid_tracks(united, turns, times, images, device, generator)
-            tracks = turned if bodies else tracks
+            tracks, bodies = rigid_tracks(tracks, stands, turns, times, images, device, generator)
     scene = scene_with(static, tracks, config, device, generator, own_field, sheets=sheets)
     found = f"{share:.1%} of what it lacks can be followed: nothing is added"
     if tracks is not None:

@@ -15,24 +15,25 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lapgs_wgpu.discovery.residual import Residual
-from lapgs_wgpu.discovery.tracks import Tracks
-from lapgs_wgpu.discovery.turns import harmonics, part_radius
+from lapgs_wgpu.discovery.tracks import Tracks, parabolas
+from lapgs_wgpu.discovery.turns import SPREAD, harmonics, part_radius
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.rasterize import rasterize
 
 POINTS = 300  # of a body
 SPACING = 0.5  # standard deviation of a Gaussian in distances of a body's points, at first
 OPACITY = 1.5  # logit, at first
-STEPS = 600  # twice as many wander off where things turn by 15 degrees and more from one time to the next
-SHAPE_FIRST = 120  # steps before bodies are turned and shifted
-RATES = {"points": 2e-3, "colors": 2e-2, "sizes": 1e-2, "opacities": 3e-2, "light": 5e-3, "turns": 5e-3, "shifts": 1e-3}
+STEPS = 800
+SHAPE_FIRST = 60  # steps before bodies are turned and shifted
+RATES = {"points": 2e-3, "colors": 2e-2, "sizes": 1e-2, "opacities": 3e-2, "light": 5e-3, "turns": 1e-2, "shifts": 1e-3}
 LAST = 0.05  # of these rates, in the end; they fall over the second half
 UNEXPLAINED = 0.3  # of what the static fit lacks where a body is: more is left over of what is not rigid
-SMOOTHING = 1.5  # times; standard deviation of the weights that make a turn and a shift of those around
+SPREADS = {"turns": SPREAD, "shifts": 2.0}  # time steps; of the weights by which parabolas are fitted around each time
 
 
 def rigid_tracks(
     tracks: Tracks,
+    stands: NDArray[np.int64],
     rotations: Mapping[int, NDArray[np.float64]],
     times: NDArray[np.float64],
     images: Sequence[Residual],
@@ -41,11 +42,12 @@ def rigid_tracks(
 ) -> tuple[Tracks, int]:
     """The tracks, in which the parts of the given rotations (T, 3, 3) at the times (T,) are rigid bodies, and how many.
 
+    stands: (p,) which part stands for each; a body takes the place of all for which its part stands.
     Other parts are drawn, too, as they are, and so stay those of which too little of the images is explained.
     """
     parts = list(rotations)
     radii = torch.tensor([part_radius(tracks, k) for k in parts])
-    others = ~np.isin(tracks.part, parts)
+    others = ~np.isin(stands[tracks.part], parts)
     R0 = torch.from_numpy(np.stack([rotations[k] for k in parts], axis=1)).float()
     centers = torch.from_numpy(np.stack([tracks.paths[:, tracks.part == k].mean(axis=1) for k in parts], axis=1))
     soft_paths, soft_colors = torch.from_numpy(tracks.paths[:, others]), torch.from_numpy(tracks.colors[others])
@@ -53,9 +55,8 @@ def rigid_tracks(
     points = _sphere(POINTS) * radii[:, None, None]
     size = torch.log(SPACING * (4 * np.pi / POINTS) ** 0.5 * radii)[:, None].repeat(1, POINTS).ravel()
     soft_size = torch.full((int(others.sum()),), float(size.mean()))
-    clock = torch.arange(len(times))
-    near = torch.exp(-0.5 * ((clock[:, None] - clock) / SMOOTHING) ** 2)
-    near = near / near.sum(dim=1, keepdim=True)
+    weights = {name: parabolas(times, np.ones(len(times)), spread) for name, spread in SPREADS.items()}
+    around = {name: torch.from_numpy(each).float() for name, each in weights.items()}
     values = {
         "points": points,
         "colors": torch.cat([torch.full((count, 3), 0.4), soft_colors]),
@@ -70,7 +71,7 @@ def rigid_tracks(
     optimizer = torch.optim.Adam([{"params": [value], "name": name} for name, value in values.items()])
 
     def poses(at: int | slice) -> tuple[Tensor, Tensor]:
-        turns, shifts = (torch.tensordot(near[at], values[name], 1) for name in ("turns", "shifts"))
+        turns, shifts = (torch.tensordot(around[name][at], values[name], 1) for name in ("turns", "shifts"))
         return torch.linalg.matrix_exp(_cross(turns)) @ R0[at], centers[at] + shifts
 
     order: list[int] = []
@@ -114,7 +115,7 @@ def rigid_tracks(
         paths = (values["points"] @ R.transpose(2, 3) + center[:, :, None]).numpy()
         colors = values["colors"][:count].clamp(0, 1).reshape(len(parts), POINTS, 3).numpy()
     bodies = [_Body(k, paths[:, n], colors[n]) for n, k in enumerate(parts) if rigid[n]]
-    return _with_bodies(tracks, bodies), len(bodies)
+    return _with_bodies(tracks, stands, bodies), len(bodies)
 
 
 class _Body(NamedTuple):
@@ -125,9 +126,9 @@ class _Body(NamedTuple):
     colors: NDArray[np.float32]
 
 
-def _with_bodies(tracks: Tracks, bodies: list[_Body]) -> Tracks:
+def _with_bodies(tracks: Tracks, stands: NDArray[np.int64], bodies: list[_Body]) -> Tracks:
     """The tracks, with bodies in place of parts; their positions are those at the times where the parts were found."""
-    others = ~np.isin(tracks.part, [body.part for body in bodies])
+    others = ~np.isin(stands[tracks.part], [body.part for body in bodies])
     over_time = tracks.paths[:, others], tracks.supported[:, others]
     parts = [(tracks.positions[others], tracks.colors[others], tracks.part[others], *over_time)]
     for body in bodies:

@@ -238,23 +238,26 @@ def _explained(paths: Floats, part: NDArray[np.int64], clouds: Sequence[Points],
     return counts
 
 
+def parabolas(times: NDArray[np.float64], weights: NDArray[np.float64], spread: float) -> NDArray[np.floating]:
+    """(T, T) what turns values at the times (T,) into those of the parabolas fitted around each, by weights (T,) of
+    the values and by a Gaussian of this standard deviation, time steps."""
+    clock = times / time_step(times)
+    lapses = (clock - clock[:, None]) / spread
+    basis = np.stack([np.ones_like(lapses), lapses, lapses**2], axis=2)
+    weighted = np.swapaxes(basis, 1, 2) * (np.exp(-0.5 * lapses**2) * weights)[:, None]
+    return np.linalg.solve(weighted @ basis + np.diag([0.0, RIDGE, RIDGE]), weighted)[:, 0]
+
+
 def _smoothed(
     times: NDArray[np.float64], paths: Floats, supported: NDArray[np.bool_], part: NDArray[np.int64]
 ) -> Floats:
     """Paths (T, n, 3), each a parabola fitted to the times around: the image of a time shows one side of a part, and
     pulls it towards that side."""
-    clock = times / time_step(times)
-    lapses = clock[:, None] - clock
-    falloff = np.exp(-0.5 * (lapses / SMOOTHING) ** 2)
-    basis = np.stack([np.ones_like(lapses), -lapses / SMOOTHING, (lapses / SMOOTHING) ** 2], axis=2)
-    ridge = np.diag([0.0, RIDGE, RIDGE])
     smooth = np.empty_like(paths)
     for k in range(int(part.max()) + 1):
         members = part == k
-        weights = falloff * np.where(supported[:, members][:, 0], 1.0, UNSUPPORTED)
-        weighted = np.swapaxes(basis, 1, 2) * weights[:, None]
-        parabolas = np.linalg.solve(weighted @ basis + ridge, weighted)  # (T, 3, T): coefficients at each time
-        smooth[:, members] = np.tensordot(parabolas[:, 0], paths[:, members], axes=1)
+        weights = np.where(supported[:, members][:, 0], 1.0, UNSUPPORTED)
+        smooth[:, members] = np.tensordot(parabolas(times, weights, SMOOTHING), paths[:, members], axes=1)
     return smooth
 
 
