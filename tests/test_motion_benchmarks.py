@@ -11,8 +11,7 @@ import object_metrics
 import pytest
 from motion_scenes import MotionScene, moving_objects
 from motion_writer import write_motion
-from moving_pixels import differs_from_median, still_backgrounds
-from object_metrics import ObjectFrame, measure_object, object_truths, summarise, visible
+from object_metrics import ObjectFrame, measure_object, object_truths, visible
 from PIL import Image
 
 from lapgs_wgpu.data import load_dataset
@@ -22,19 +21,6 @@ from lapgs_wgpu.run import train
 from lapgs_wgpu.train.presets import load_config
 
 pytestmark = pytest.mark.nightly
-TIMES = np.linspace(0, 1, 201)
-
-
-@pytest.mark.parametrize("path", [0.5, 1, 2, 4, 8])
-@pytest.mark.parametrize("cycles", [0.5, 1, 5])
-def test_paths_are_as_wide_and_as_often_travelled_as_asked(path: float, cycles: float) -> None:
-    moving = [one for one in moving_objects(MotionScene(path=path, cycles=cycles)) if one.moves]
-    assert [one.name for one in moving] == ["ball", "box"]
-    for one in moving:
-        places = one.positions(TIMES)
-        apart = np.linalg.norm(places[:, None] - places[None], axis=2)
-        assert apart.max() == pytest.approx(path * one.diameter, rel=1e-3)
-        assert one.positions([0.0]) == pytest.approx(one.positions([1 / cycles]))
 
 
 def test_masks_and_clean_plates_match_the_images(tmp_path: Path) -> None:
@@ -84,15 +70,6 @@ def test_the_measures_know_the_answer(tmp_path: Path) -> None:
     assert np.median([frame.distance for frame in shifted if frame.distance]) == pytest.approx(0.5, abs=0.1)
 
 
-def test_summary_over_frames_and_objects() -> None:
-    frames = [
-        ObjectFrame("a", 20.0, 0.9, 0.1), ObjectFrame("b", 10.0, 0.0, None), ObjectFrame("a", 30.0, 0.5, 0.3),
-        ObjectFrame("a", 28.0, 0.4, None),
-    ]  # fmt: skip
-    assert summarise(frames) == (18, pytest.approx(1 / 3), np.inf)
-    assert summarise([frame for frame in frames if frame.name == "a"]) == (26, pytest.approx(2 / 3), 0.3)
-
-
 def test_a_run_is_measured(tmp_path: Path, device: Device) -> None:
     folder = write_motion(tmp_path / "scene", MotionScene(path=4), size=32, train_times=4, test_views=2)
     given = {"data.path": str(folder), "schedule.steps": 2, "points.count": 50, "field.width": 8}
@@ -114,14 +91,3 @@ def test_turns_and_swaps_are_seen_in_paths() -> None:
     assert object_metrics.turns_and_swaps(np.concatenate([turning[0], still[1]], axis=1), objects, times)[0] < 0.7
     swapped = np.concatenate([np.where(times[:, None, None] > 0.8, turning[1 - n], turning[n]) for n in (0, 1)], axis=1)
     assert object_metrics.turns_and_swaps(swapped, objects, times)[1] == 2
-
-
-def test_pixels_that_move_before_a_still_camera(tmp_path: Path) -> None:
-    folder = write_motion(tmp_path / "scene", MotionScene(camera="still"), size=48, train_times=9, test_views=8)
-    views = load_dataset(folder).test
-    backgrounds = still_backgrounds(views, lambda view: composite(view.load(), np.zeros(3)))
-    for view, background, objects in zip(views, backgrounds, object_truths(folder, "test", views), strict=True):
-        assert background is not None
-        moving = differs_from_median(composite(view.load(), np.zeros(3)), background)
-        shown = np.any([one.mask() == 255 for one in objects], axis=0)
-        assert moving[shown].mean() > 0.7

@@ -12,10 +12,7 @@ import run_table
 from synthetic import write_synthetic
 
 from lapgs_wgpu import command
-from lapgs_wgpu.data import Dataset
-from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.presets import load_config, write_toml
-from lapgs_wgpu.train.run_folder import STATE
 
 ROOT = Path(__file__).parents[1]
 SPEC = """
@@ -74,25 +71,6 @@ def test_the_committed_specs_are_valid(file: Path) -> None:
     assert run_table.read_spec(file)
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "named"),
-    [
-        ("width", "widht", "field.widht"),
-        ('scenes = ["toys"]', 'scenes = ["toy"]', "rows.grid4d.scenes"),
-        ('\ntoys = "toys"', '\ntoys = "toyz"', "toyz"),
-    ],
-)
-def test_mistakes_end_in_one_sentence_before_any_training(
-    before: str, after: str, named: str, data: Path, spec: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    spec.write_text(SPEC.replace(before, after))
-    assert make(spec, data) == 2
-    out, err = capsys.readouterr()
-    assert (out, err.count("\n")) == ("", 1)
-    assert named in err
-    assert not (spec.parent / "out").exists()
-
-
 @pytest.fixture
 def trained(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Instead of training, leaves a run folder with made-up figures, and notes here which run it was."""
@@ -135,30 +113,6 @@ def test_finished_runs_are_skipped_others_trained_again(
     assert make(spec, data) == 0
     expected = ["toys, static, seed 3", "toys, static, seed 5", "toys, grid4d, seed 5", "others, static, seed 3"]
     assert trained == expected
-
-
-def test_an_interrupted_table_goes_on(
-    spec: Path, data: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    called: list[tuple[str, str, Path]] = []
-
-    def interrupted(how: str) -> Any:
-        def call(config: Config, dataset: Dataset, folder: Path, **_: object) -> None:
-            called.append((how, config.data.path, folder))
-            raise KeyboardInterrupt("stopped after step 1 of 3.")
-
-        return call
-
-    monkeypatch.setattr(run_table, "train", interrupted("train"))
-    monkeypatch.setattr(run_table, "resume", interrupted("resume"))
-    assert make(spec, data) == command.INTERRUPTED
-    assert "run 1 of 5" in capsys.readouterr().err
-    folder = spec.parent / "out" / "toys" / "static" / "seed3"
-    folder.mkdir(parents=True)
-    (folder / STATE).write_bytes(b"state")
-    (folder / "config.toml").write_text(write_toml(dataclasses.asdict(run_table.read_spec(spec)[0].config)))
-    assert make(spec, data) == command.INTERRUPTED
-    assert called == [(how, str(data / "toys"), folder) for how in ("train", "resume")]
 
 
 def result(scene: str, row: str, seed: int, psnr: float, **more: Any) -> run_table.Result:
