@@ -20,12 +20,8 @@ def bench(*arguments: str | Path, scene: str = SCENE) -> str:
 
 
 @pytest.fixture(scope="module")
-def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("bench") / "bench.json"
-
-
-@pytest.fixture(scope="module")
-def results(file: Path) -> dict:
+def results(tmp_path_factory: pytest.TempPathFactory) -> dict:
+    file = tmp_path_factory.mktemp("bench") / "bench.json"
     table = bench("--parts", "raster", "encoder", "losses", "step", "shares", "--json", file)
     for words in (
         "rasterize_bwd",
