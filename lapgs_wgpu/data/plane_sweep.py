@@ -43,7 +43,7 @@ PATCH = 12  # pixels of a window at about one depth: fewer are chance
 EDGE = 0.05  # difference of two colors across which depths hardly spread
 HELD = 1e3  # weight of believed depths, relative to those of their neighbors
 MOVED = 0.08  # difference of a color from the median from which on something moves there
-MOMENTS = (0.1, 0.3, 0.5, 0.7, 0.9)  # of a rig's clip, at which what moves is searched for
+MOVER_TIMES = (0.1, 0.3, 0.5, 0.7, 0.9)  # of a rig's clip, at which what moves is searched for
 FLAT = 1e-8  # product of two variances, below which windows are flat and look like nothing
 
 
@@ -81,18 +81,21 @@ def still_surface(dataset: Dataset) -> Surface | None:
     points, colors = _kept(found)
     text = f"start: {len(points)} points on surfaces, {share:.0%} of the pixels of {len(stills)} cameras"
     if dataset.is_rig:
-        still = len(points)
-        for time in np.quantile(dataset.times, MOMENTS):
+        still_count = len(points)
+        for time in np.quantile(dataset.times, MOVER_TIMES):
             more, their_colors = _moved(dataset, stills, dataset.depths, float(time))
             points, colors = np.concatenate([points, more]), np.concatenate([colors, their_colors])
-        if len(points) > still:
-            text += f", and {len(points) - still} on what moves, at {len(MOMENTS)} times"
+        if len(points) > still_count:
+            text += f", and {len(points) - still_count} on what moves, at {len(MOVER_TIMES)} times"
     say(text)
     return Surface(points, colors, share) if share else None
 
 
 def _moved(dataset: Dataset, stills: list[_Still], bounds: tuple[float, float], time: float) -> tuple[Points, Points]:
-    """Points and colors (N, 3) of the surfaces that differ at a time from what stands still. bounds: as below."""
+    """Points and colors (N, 3) of the surfaces that differ at a time from what stands still.
+
+    bounds: nearest and furthest depth, world units.
+    """
     now = _stills(dataset, at=time)
     changes = [np.abs(one.colors - still.colors).mean(axis=2) for one, still in zip(now, stills, strict=True)]
     moved = [_box(change).ravel() > MOVED for change in changes]
