@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -14,7 +16,8 @@ from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation, TimeSamples
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import AccelerationConfig
-from lapgs_wgpu.train.motion_losses import WOBBLE, acceleration_loss, draw_times
+from lapgs_wgpu.train.motion_losses import WOBBLE, acceleration_loss, compared_counts, draw_times
+from lapgs_wgpu.train.step_result import Scheduled
 from lapgs_wgpu.train.trainer import Trainer
 
 CONFIG = AccelerationConfig(weight=1.0, share=0.5)
@@ -77,13 +80,11 @@ def test_chosen_rows_move_as_all_do(device: Device) -> None:
 def test_times_lie_half_to_whole_the_reach_apart() -> None:
     generator = torch.Generator().manual_seed(0)
     for _ in range(50):
-        samples = draw_times(CONFIG, 40, 0.5, 101, generator)
-        assert samples is not None
+        samples = draw_times(20, 40, 0.5, 101, generator)
         assert len(samples.rows) == 20
         assert 0.01 <= 0.5 - samples.times[0] <= 0.02
         assert samples.times[1] - 0.5 == pytest.approx(0.5 - samples.times[0])
-    near_end = draw_times(CONFIG, 40, 0.995, 101, generator)
-    assert near_end is not None
+    near_end = draw_times(20, 40, 0.995, 101, generator)
     assert near_end.times[1] == 1
 
 
@@ -91,8 +92,8 @@ def test_times_lie_half_to_whole_the_reach_apart() -> None:
     ("config", "count", "times"), [(AccelerationConfig(), 40, 101), (CONFIG, 1, 101), (CONFIG, 40, 1), (CONFIG, 40, 2)]
 )
 def test_nowhere_to_look(config: AccelerationConfig, count: int, times: int) -> None:
-    generator = torch.Generator().manual_seed(0)
-    assert draw_times(config, count, 0.5, times, generator) is None
+    whole = dataclasses.replace(configure(), acceleration=config)
+    assert compared_counts(whole, Scheduled(1, True, 1.0, seen=True), count, times, fitted=False)[1] == 0
 
 
 def test_it_rests_where_discovery_explains_what_moves(dataset: Dataset, device: Device) -> None:
@@ -100,7 +101,7 @@ def test_it_rests_where_discovery_explains_what_moves(dataset: Dataset, device: 
         configure(acceleration__weight="1", acceleration__interval="1", schedule__warm_up="0"), dataset, device
     ) as training:
         assert training.step().terms["acceleration"] > 0
-        training._exchange.field_fitted = True
+        training._learners.field_fitted = True
         assert "acceleration" not in training.step().terms
 
 

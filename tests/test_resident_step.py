@@ -30,7 +30,6 @@ from lapgs_wgpu.splat.drawing import Drawing
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.exchange_step import Sample
 from lapgs_wgpu.train.resident_step import Flying
 from lapgs_wgpu.train.resident_task import Task
 from lapgs_wgpu.train.run_folder import load_state
@@ -91,8 +90,8 @@ def by_torch(trainer: Trainer, sample: Task, *, moving: bool) -> dict[str, Tenso
         nearby = Nearby(chosen, offsets, sample.near_time, smooth.static, smooth.temporal)
     if sample.even is not None:
         times = TimeSamples(sampled_rows.rows(sample.even), sample.even_times)
-    given = Sample(sample.view, torch.tensor(sample.background), moving, nearby, times)
-    trainer._exchange._descend(given, 4)
+    scheduled, background = Scheduled(4, moving, 1.0, seen=True), torch.tensor(sample.background)
+    trainer._exchange._descend(scheduled, sample.view, background, nearby, times)
     scene = trainer.scene
     named = {**scene.parameters, **(dict(scene.field.named_parameters()) if scene.field else {})}
     gradients = {name: torch.zeros_like(p) if p.grad is None else p.grad for name, p in named.items()}

@@ -14,11 +14,8 @@ if TYPE_CHECKING:
 
 
 def capture_views(scene: LoadedScene) -> tuple[View, ...]:
-    """Open the capture that the config.toml beside a checkpoint names.
-
-    Returns:
-        Its views, those held out first; none where the scene is of no run, or the capture is not here.
-    """
+    """The views of the capture that the config.toml beside a checkpoint names, those held out first; none where the
+    scene is of no run, or the capture is not here."""
     from lapgs_wgpu.data import load_dataset  # not before the first picture
 
     try:

@@ -36,11 +36,9 @@ _PROGRESS = 1000
 def export_4dgs(scene: LoadedScene, file: Path, max_error: float) -> Loss:
     """Write a `.4dgs` of a scene that moves, and compare what the library reads in it with the scene. Atomic.
 
-    Args:
-        max_error: how far a point of the ellipsoid of one standard deviation of a Gaussian may lie from where the field
-            has it, pixels of the captured images at the distance of the focus.
-
-    Raises InputError where the file cannot be written, nothing moves or can be seen, or the package fourdgs is missing.
+    max_error: how far a point of the ellipsoid of one standard deviation of a Gaussian may lie from where the field has
+    it, pixels of the captured images at the distance of the focus. Raises InputError where the file cannot be written,
+    nothing moves or can be seen, or the package fourdgs is missing.
     """
     try:
         import fourdgs

@@ -40,14 +40,9 @@ def place(
 ) -> Placement:
     """Determine the cube that a capture fills, and bring cloud and depths into the world's coordinates.
 
-    Args:
-        capture: with or without a cloud.
-        training: its training frames.
-        cameras: the distinct cameras of these, in the capture's coordinates.
-        moving: the cube of what moves, in the capture's coordinates; None for that of the whole scene.
-
-    Raises:
-        InputError: nothing tells where the scene is.
+    training: its training frames. cameras: the distinct cameras of these, in the capture's coordinates. moving: the
+    cube of what moves, in these, too; None for that of the whole scene. Raises InputError where nothing tells where the
+    scene is.
     """
     depths, warnings = _depths(capture, training, cameras)
     cube = moving or _cube(capture, cameras, depths)

@@ -18,12 +18,9 @@ _LIMITS = {"above": operator.gt, "at_least": operator.ge, "below": operator.lt, 
 
 
 def option(text: str, default: Any = dataclasses.MISSING, **limits: float) -> Any:
-    """A field of `Options`.
+    """A field of `Options`; one without a default must stand in every table.
 
-    Args:
-        text: help text.
-        default: a field without one must stand in every table.
-        limits: above, at_least, below, at_most; of a tuple they hold for each entry.
+    text: of the help. limits: above, at_least, below, at_most; of a tuple they hold for each entry.
     """
     return dataclasses.field(default=default, metadata={"help": text, "limits": limits})
 
@@ -43,14 +40,8 @@ class Options:
 def build_dataclass(cls: type[T], table: Any, source: str, prefix: str = "", *, advice: str = "") -> T:
     """A dataclass from a parsed TOML or JSON table. Every key must be known, and every value of the field's type.
 
-    Args:
-        table: a missing key takes the field's default.
-        source: where the table comes from, for errors.
-        prefix: of the keys, for errors.
-        advice: what to do where a key without a default is missing, for errors.
-
-    Raises:
-        InputError: names the key.
+    A missing key takes the field's default. For errors: source, where the table comes from; prefix of the keys; advice
+    where a key without a default is missing. Raises InputError, which names the key.
     """
     if not isinstance(table, dict):
         raise InputError(f"{source}: {prefix.rstrip('.') or 'it'} must be a table, got {shown(table)}.")

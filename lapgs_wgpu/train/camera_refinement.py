@@ -131,16 +131,12 @@ Corrections = Mapping[int, Array]
 class CameraRefinement:
     """The corrections of all training cameras, and how they learn.
 
-    Args:
-        cameras: distinct ones.
-        extent: distance that counts as 1 in shifts, world units.
-        config: of the refinement.
-        points: the scene as it is, asked at each step: what moves how far in the image when a camera moves.
-        before: corrections to go on from, at the final learning rate and from the first step on.
+    cameras: distinct ones. extent: distance that counts as 1 in shifts, world units. points: the scene as it is, asked
+    at each step: what moves how far in the image when a camera moves. before: corrections to go on from, at the final
+    learning rate and from the first step on.
 
-    Attributes:
-        numbers: of the cameras (the same objects).
-        common: (6 C, r) orthonormal: changes of all cameras that no image shows.
+    numbers: of the cameras (the same objects). common: (6 C, r) orthonormal: changes of all cameras that no image
+    shows.
     """
 
     name = "cameras"

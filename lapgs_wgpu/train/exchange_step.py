@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 from torch import Tensor
 
@@ -19,46 +18,16 @@ from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.ground_truth import AHEAD, GroundTruth
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.loss_terms import LossTerm, Regularizer, weight_at
-from lapgs_wgpu.train.motion_losses import acceleration_loss, draw_nearby, draw_times
+from lapgs_wgpu.train.motion_losses import acceleration_loss, compared_counts, draw_nearby, draw_times
 from lapgs_wgpu.train.nonfinite import Skipped, cause, check_parameters, finite
 from lapgs_wgpu.train.step_result import Measured, Scheduled
 from lapgs_wgpu.train.view_order import Draws
 
 
-class Sample(NamedTuple):
-    """A view of a step, and what the losses of motion compare there.
-
-    Attributes:
-        view: of the training.
-        background: (3,) that its image lies on.
-        moving: whether the field moves the Gaussians.
-        nearby: the places that the smoothness loss compares; None in steps without it.
-        time_samples: the times that the acceleration loss compares; None in steps without it.
-    """
-
-    view: View
-    background: Tensor
-    moving: bool
-    nearby: Nearby | None
-    time_samples: TimeSamples | None
-
-
 class ExchangeStep:
     """Takes the steps of a training: the gradients of a view's loss, then the optimizers.
 
-    Args:
-        config: resolved for the dataset.
-        scene: that is trained.
-        own_terms: of the loss, beside those of the configuration (docs/api.md).
-        dataset: the capture.
-        learners: that are moved.
-        density: whose statistics take the views in.
-        truth: of the views.
-        draws: of the training.
-
-    Attributes:
-        field_fitted: whether discovery has fitted the field to nearly all that moves. Its depth is known from there,
-            and the acceleration loss is left out.
+    own_terms: of the loss, beside those of the configuration (docs/api.md).
     """
 
     def __init__(
@@ -75,7 +44,6 @@ class ExchangeStep:
         self._config, self._scene, self._own_terms = config, scene, own_terms
         self._time_count, self._extent = dataset.moments, dataset.extent
         self._learners, self._density, self._truth, self._draws = learners, density, truth, draws
-        self.field_fitted = False
 
     def take(self, scheduled: Scheduled, began: Callable[[], None]) -> Callable[[], Measured]:
         """Take a step; gives what it told.
@@ -85,10 +53,10 @@ class ExchangeStep:
         """
         step, draws = scheduled.step, self._draws
         (view, background), drawn = draws.next(), draws.mark()
-        sample = self._sample(view, background, step, moving=scheduled.moving)
+        compared = self._compared(scheduled, self._scene.timing(view.time))
         self._truth.prefetch([view, *draws.coming(AHEAD)])
         self._learners.zero_grad()
-        measured, rendering = self._descend(sample, step)
+        measured, rendering = self._descend(scheduled, view, background, *compared)
         d_means2d = rendering.means2d.grad
         assert d_means2d is not None
         what = self._not_finite(measured, d_means2d, began)
@@ -104,34 +72,35 @@ class ExchangeStep:
                 self._density.statistics.add(rendering.radii, d_means2d, view.camera)
         return lambda: measured
 
-    def _sample(self, view: View, background: Tensor, step: int, *, moving: bool) -> Sample:
-        """Draw what the losses of motion compare in a step, counted from 1."""
+    def _compared(self, scheduled: Scheduled, t: float) -> tuple[Nearby | None, TimeSamples | None]:
+        """Draw what the losses of motion compare at a time of the field, None for each that is off."""
         config, count, generator = self._config, len(self._scene), self._draws.generator
-        nearby = time_samples = None
-        if moving and step > config.smoothness.start:
-            t = self._scene.timing(view.time)
-            nearby = draw_nearby(config.smoothness, count, t, generator)
-            left_out = self.field_fitted or step % config.acceleration.interval
-            if not left_out and self._scene.field is not None:
-                time_samples = draw_times(config.acceleration, count, t, self._time_count, generator)
-        return Sample(view, background, moving, nearby, time_samples)
+        near, even = compared_counts(config, scheduled, count, self._time_count, fitted=self._learners.field_fitted)
+        nearby = draw_nearby(config.smoothness, near, count, t, generator) if near else None
+        if not even or self._scene.field is None:
+            return nearby, None
+        return nearby, draw_times(even, count, t, self._time_count, generator)
 
-    def _descend(self, sample: Sample, step: int) -> tuple[Measured, RenderLoss]:
-        """Add the gradients of a view's loss, in a step counted from 1, to those of all that learns."""
-        config, scene, view = self._config, self._scene, sample.view
+    def _descend(
+        self,
+        scheduled: Scheduled,
+        view: View,
+        background: Tensor,
+        nearby: Nearby | None,
+        time_samples: TimeSamples | None,
+    ) -> tuple[Measured, RenderLoss]:
+        """Add the gradients of a view's loss to those of all that learns."""
+        config, scene, moving = self._config, self._scene, scheduled.moving
         camera, correction = self._learners.refined_camera(view), self._learners.exposure(view)
-        if sample.moving:
-            now = scene.deformed(view.time, sample.nearby, sample.time_samples)
-        else:
-            now = Deformed(scene.canonical(), None, [])
-        weights = config.loss.weights(warm=sample.moving)
-        weighted = [(term, weight) for term in self._own_terms if (weight := weight_at(term, step))]
+        now = scene.deformed(view.time, nearby, time_samples) if moving else Deformed(scene.canonical(), None, [])
+        weights = config.loss.weights(warm=moving)
+        weighted = [(term, weight) for term in self._own_terms if (weight := weight_at(term, scheduled.step))]
         of_image = [(term, weight) for term, weight in weighted if not isinstance(term, Regularizer)]
         rendering = render_loss(
             now.gaussians,
             camera.camera,
             self._truth.on_device(view),
-            sample.background,
+            background,
             weights,
             scene.device,
             correction,
@@ -142,10 +111,10 @@ class ExchangeStep:
         of_motion: dict[str, Tensor] = {}
         if now.smoothness is not None:
             of_motion["smoothness"] = now.smoothness
-        if sample.time_samples is not None:
+        if time_samples is not None:
             weight = config.acceleration.weight * config.acceleration.interval
-            of_motion["acceleration"] = weight * acceleration_loss(now, scene.timing(view.time), sample.time_samples)
-        if sample.moving and config.loss.dynamics and "dynamics" in scene.parameters:
+            of_motion["acceleration"] = weight * acceleration_loss(now, scene.timing(view.time), time_samples)
+        if moving and config.loss.dynamics and "dynamics" in scene.parameters:
             of_motion["dynamics"] = config.loss.dynamics * dynamics_loss(scene.parameters["dynamics"])
         for term, weight in weighted:
             if isinstance(term, Regularizer):

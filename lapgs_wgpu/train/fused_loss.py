@@ -27,12 +27,9 @@ from lapgs_wgpu.train.loss_terms import TorchLoss, torch_loss
 class RenderLoss(NamedTuple):
     """A rendering that was compared with its ground truth.
 
-    Attributes:
-        loss: a scalar, differentiable in the Gaussians' tensors, in the correction and in the camera's change.
-        terms: l1, mse (mean squared error), ssim, pyramid and ncc (losses), as far as they were computed, and further
-            terms by name; without weights.
-        radii: (N,) as in splat.rasterize.Rendering.
-        means2d: (N, 2) likewise.
+    loss: a scalar, differentiable in the Gaussians' tensors, in the correction and in the camera's change. terms: l1,
+    mse (mean squared error), ssim, pyramid and ncc (losses), as far as they were computed, and further terms by name;
+    without weights. radii (N,), means2d (N, 2): as in splat.rasterize.Rendering.
     """
 
     loss: Tensor
@@ -79,18 +76,11 @@ def render_loss(
 
     The same bits on every run of one adapter and driver. The gradients are always computed.
 
-    Args:
-        gaussians: activated, float32, with harmonics.
-        camera: that sees them.
-        truth: (H, W) as `upload_rgba` leaves it, of the camera's size.
-        background: (3,) in [0, 1], under both; not differentiable.
-        weights: of the terms.
-        device: that computes.
-        correction: (3, 4) of the image's colors before they are compared (train/exposure); None for none.
-        own: further terms of the image, with their weights.
-        camera_change: (6,) zeros, which get the gradient by a small change of the camera: rotation, shift in units of
-            `camera_unit` (splat.drawing.CameraGradient); None for none.
-        camera_unit: world units.
+    gaussians: activated, float32, with harmonics. truth: (H, W) as `upload_rgba` leaves it, of the camera's size.
+    background: (3,) in [0, 1], under both; not differentiable. correction: (3, 4) of the image's colors before they are
+    compared (train/exposure). own: further terms of the image, with their weights. camera_change: (6,) zeros, which get
+    the gradient by a small change of the camera: rotation, shift in units of `camera_unit`, world units
+    (splat.drawing.CameraGradient).
     """
     of_gaussians = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh
     probe = gaussians.means.new_empty((len(gaussians), 2)).requires_grad_()

@@ -30,10 +30,8 @@ AHEAD = 8  # images that are decoded before they are needed
 class GroundTruth:
     """The ground truth of training views. The most recently used images stay on the device.
 
-    Args:
-        device: that compares.
-        color: (3,) in [0, 1] that transparent images are laid on; None where each step draws its own.
-        max_bytes: bound on what is kept on the device, 4 bytes a pixel. A larger image is given and not kept.
+    color: (3,) in [0, 1] that transparent images are laid on; None where each step draws its own. max_bytes: bound on
+    what is kept on the device, 4 bytes a pixel. A larger image is given and not kept.
     """
 
     def __init__(self, device: Device, color: Tensor | None, max_bytes: int) -> None:
@@ -96,14 +94,8 @@ def marked_pixels(view: View, color: Tensor | None) -> NDArray[np.uint8]:
     """The image of a view, (H, W, 3) RGB or (H, W, 4) straight RGBA in 8 bits, with ignored pixels marked.
 
     A transparent pixel gets no color, whatever the file says: with red 1 it is left out of the losses
-    (shaders/common/on_background.wgsl), with 0 it counts.
-
-    Args:
-        view: of the training.
-        color: (3,) that a transparent image is laid on; None to keep the transparency.
-
-    Raises:
-        InputError: the image or its mask cannot be read.
+    (shaders/common/on_background.wgsl), with 0 it counts. color: (3,) that a transparent image is laid on; None to keep
+    the transparency. Raises InputError where the image or its mask cannot be read.
     """
     pixels, ignored = view.load(), view.load_ignored()
     if color is not None:

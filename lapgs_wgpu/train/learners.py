@@ -24,17 +24,9 @@ Refiner = FrequencyOptimizer | Exposures | CameraRefinement
 class Learners:
     """The optimizer of the Gaussians and the field, and what learns beside it.
 
-    Args:
-        config: resolved for the dataset.
-        dataset: the capture.
-        parts: learning rates beside those of the configuration.
-        start: the scene, and what cameras were corrected by before.
-
-    Attributes:
-        optimizer: of the Gaussians and the field.
-        frequencies: of the motion spectrum; None where there is none.
-        image_numbers: by name of a training view the number of its colors' correction.
-        on_access: called before corrections are read or changed from outside: a device may have newer ones.
+    frequencies: of the motion spectrum; None where there is none. image_numbers: by name of a training view the number
+    of its colors' correction. on_access: called before corrections are read or changed from outside: a device may have
+    newer ones.
     """
 
     def __init__(self, config: Config, dataset: Dataset, parts: Parts, start: Start) -> None:
@@ -42,6 +34,7 @@ class Learners:
         self._groups = scene.field.parameter_groups() if scene.field else {}
         rates = parts.rates_of(config.rates.schedules(), scene.parameters, self._groups)
         self.optimizer = Optimizer(scene.parameters, self._groups, rates)
+        self.field_fitted = start.field_fitted
         self.frequencies = None
         if scene.spectrum is not None:
             limit = nyquist_frequency(dataset)
@@ -72,9 +65,15 @@ class Learners:
         self.on_access()
         return self._exposures
 
-    def limit_field_rates(self, *, field_fitted: bool) -> None:
-        """Hold the field's learning rates low where discovery has fitted it to nearly all that moves."""
-        self.optimizer.highest = max_field_rates(self._groups) if field_fitted else {}
+    @property
+    def field_fitted(self) -> bool:
+        """Whether discovery has fitted the field to nearly all that moves: its learning rates are then held low."""
+        return self._field_fitted
+
+    @field_fitted.setter
+    def field_fitted(self, fitted: bool) -> None:
+        self._field_fitted = fitted
+        self.optimizer.highest = max_field_rates(self._groups) if fitted else {}
 
     def refined_camera(self, view: View) -> RefinedCamera:
         """The camera of a training view, corrected where it is, and what gets the gradient by it."""

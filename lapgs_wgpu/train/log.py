@@ -28,12 +28,8 @@ class Log:
     except in the first line after a resumption, which averages the steps since then. Evaluations do not count as time
     of the training.
 
-    Args:
-        path: of log.jsonl, which is written anew, or continued after the step `done`.
-        steps: of the whole training.
-        done: number of steps that are done.
-        before: seconds that the training took before its first step.
-        terminal: stderr where None.
+    path: of log.jsonl, which is written anew, or continued after the step `done`. before: seconds that the training
+    took before its first step. terminal: stderr where None.
     """
 
     def __init__(

@@ -67,15 +67,8 @@ def torch_loss(
 ) -> tuple[float, np.ndarray]:
     """The value of a term, and its weighted gradient (4, H, W) by the image.
 
-    Args:
-        term: to be computed.
-        image: (4, H, W) red, green, blue, transmittance.
-        truth: (H, W) uint32 RGBA of the ground truth.
-        background: behind transparent pixels of the ground truth.
-        weight: of the term.
-
-    Raises:
-        InputError: the term returns no scalar.
+    image: (4, H, W) red, green, blue, transmittance. truth: (H, W) uint32 RGBA of the ground truth, whose transparent
+    pixels lie on the background. Raises InputError where the term returns no scalar.
     """
     planes, texels = read_all([image, truth])
     target, left_out = host_image(texels, torch.tensor(background))

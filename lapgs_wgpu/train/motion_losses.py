@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from lapgs_wgpu.motion.fields.deformation import Deformed, Nearby, TimeSamples
-from lapgs_wgpu.train.config import AccelerationConfig, SmoothnessConfig
+from lapgs_wgpu.train.config import Config, SmoothnessConfig
+from lapgs_wgpu.train.step_result import Scheduled
 
 WOBBLE = 1e-2  # world units: distances far below it count as they are, those far above it all as much as it
 EPSILON = 1e-12  # world units squared: keeps the gradient of a distance of 0 finite
@@ -20,11 +21,24 @@ EPSILON = 1e-12  # world units squared: keeps the gradient of a distance of 0 fi
 LARGEST_DISTANCE = 2.0
 
 
-def draw_nearby(config: SmoothnessConfig, count: int, t: float, generator: torch.Generator) -> Nearby | None:
-    """Where the field of `count` Gaussians is compared with itself in a step at time t; None where it is not."""
-    chosen = round(config.share * count)
-    if chosen == 0 or config.static == config.temporal == 0:
-        return None
+def compared_counts(
+    config: Config, scheduled: Scheduled, count: int, time_count: int, *, fitted: bool
+) -> tuple[int, int]:
+    """How many of `count` Gaussians the smoothness and the acceleration loss look at in a step; 0: it is off.
+
+    Of a clip of time_count = 2 times both are ends, at which the acceleration loss is 0. fitted: whether discovery has
+    fitted the field to nearly all that moves; its depth is known from there, and the acceleration loss is left out.
+    """
+    smooth, even = config.smoothness, config.acceleration
+    if not scheduled.moving or scheduled.step <= smooth.start:
+        return 0, 0
+    near_count = round(smooth.share * count) if smooth.static or smooth.temporal else 0
+    left_out = fitted or scheduled.step % even.interval or not even.weight or time_count < 3
+    return near_count, 0 if left_out else round(even.share * count)
+
+
+def draw_nearby(config: SmoothnessConfig, chosen: int, count: int, t: float, generator: torch.Generator) -> Nearby:
+    """At which `chosen` of `count` Gaussians the field is compared with itself in a step at time t."""
     rows = torch.randint(count, (chosen,), generator=generator)
     offsets = config.reach * (2 * torch.rand(chosen, 3, generator=generator) - 1)
     return Nearby(rows, offsets, near_time(config, t, generator), config.static, config.temporal)
@@ -35,17 +49,11 @@ def near_time(config: SmoothnessConfig, t: float, generator: torch.Generator) ->
     return min(max(t + config.time_reach * (2 * float(torch.rand((), generator=generator)) - 1), 0.0), 1.0)
 
 
-def draw_times(
-    config: AccelerationConfig, count: int, t: float, time_count: int, generator: torch.Generator
-) -> TimeSamples | None:
-    """Draw the times before and after t at which the acceleration loss looks, and at which of `count` Gaussians.
+def draw_times(chosen: int, count: int, t: float, time_count: int, generator: torch.Generator) -> TimeSamples:
+    """Draw the times before and after t at which the acceleration loss looks, at `chosen` of `count` Gaussians.
 
-    None where the loss is off. At an end of the clip one of the times is t itself, and the loss is 0; of a clip of
-    time_count = 2 times both are ends.
+    At an end of the clip one of the times is t itself, and the loss is 0.
     """
-    chosen = round(config.share * count)
-    if chosen == 0 or config.weight == 0 or time_count < 3:
-        return None
     rows = torch.randint(count, (chosen,), generator=generator)
     return TimeSamples(rows, even_times(t, time_count, generator))
 

@@ -79,16 +79,9 @@ def plan_training(
     most of it, fits into the time. Its steps are those of its schedule, more where the clip has many times, fewer where
     the time is short.
 
-    Args:
-        folder: of the capture.
-        opened: the capture, with images of any size.
-        device: of the training.
-        minutes: that the training may take, about; None for the whole schedule.
-        exposure: whether to learn a color correction for each image.
-        measure: times a step, seconds.
-
-    Raises:
-        InputError: the capture is not usable, or the time is too short for anything.
+    opened: the capture of the folder, with images of any size. minutes: that the training may take, about; None for the
+    whole schedule. exposure: whether to learn a color correction for each image. measure: times a step, seconds. Raises
+    InputError where the capture is not usable, or the time is too short for anything.
     """
     if minutes is not None and not 0 < minutes < math.inf:
         raise InputError(f"--minutes must be above 0, got {minutes:g}.")

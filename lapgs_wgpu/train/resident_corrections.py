@@ -40,8 +40,7 @@ _PLACES = {
 class ResidentCorrections:
     """The corrections of a training and the state by which they learn, on a device.
 
-    Attributes:
-        on_host: whether the host may have changed them since they were pushed.
+    on_host: whether the host may have changed them since they were pushed.
     """
 
     def __init__(self, device: Device, learners: Learners) -> None:

@@ -35,18 +35,12 @@ Place = tuple[slice, slice]  # rows and columns of an array
 
 @dataclass
 class Block:
-    """A matrix on the device in which torch's tensors lie.
+    """A matrix (rows, columns) on the device in which torch's tensors lie.
 
-    Attributes:
-        shape: (rows, columns).
-        group: of the optimizer that all values belong to; None where each tensor is a group of its own.
-        parts: by name of a tensor its place.
-        ones: whether the last column holds ones, which no step changes.
-        moved: number of values that Adam moves; the others have an optimizer of their own.
-        moving: whether only steps with motion move them.
-        of: the Gaussians or the field, see PARTS.
-        first: number of the part's array.
-        arrays: by kind.
+    group: of the optimizer that all values belong to; None where each tensor is a group of its own. parts: by name of a
+    tensor its place. ones: whether the last column holds ones, which no step changes. moved: number of values that Adam
+    moves; the others have an optimizer of their own. moving: whether only steps with motion move them. of: the
+    Gaussians or the field, see PARTS. first: number of the part's array. arrays: by kind.
     """
 
     name: str
@@ -86,8 +80,7 @@ class Block:
 class ResidentParameters:
     """The Gaussians and the field of a scene, and the optimizers' state, on a device.
 
-    Attributes:
-        steps: by name of a tensor, how many steps have moved it.
+    steps: by name of a tensor, how many steps have moved it.
     """
 
     def __init__(

@@ -38,10 +38,8 @@ class Recorded(NamedTuple):
 class ResidentPasses:
     """Records the passes of the steps of a training.
 
-    Attributes:
-        parameters: what the steps move. corrections: of cameras and colors, which they move, too.
-        rasterizer: that draws.
-        dynamics_loss: whether the loss has a term of the dynamics attributes.
+    parameters, corrections: what the steps move, the latter of cameras and colors. dynamics_loss: whether the loss has
+    a term of the dynamics attributes.
     """
 
     def __init__(self, config: Config, scene: Scene4D, learners: Learners) -> None:

@@ -30,7 +30,7 @@ from lapgs_wgpu.train.density_control import DensityControl
 from lapgs_wgpu.train.ground_truth import AHEAD, GroundTruth
 from lapgs_wgpu.train.image_metrics import psnr_of
 from lapgs_wgpu.train.learners import Learners
-from lapgs_wgpu.train.motion_losses import even_times, near_time
+from lapgs_wgpu.train.motion_losses import compared_counts, even_times, near_time
 from lapgs_wgpu.train.nonfinite import Skipped, cause, check_parameters
 from lapgs_wgpu.train.resident_parameters import PARTS
 from lapgs_wgpu.train.resident_passes import ResidentPasses
@@ -44,12 +44,7 @@ _OVERFLOW = 1 << 31  # close_guard.wgsl
 
 
 class Flying:
-    """A step that was submitted; called, it waits, and gives what the step told.
-
-    Attributes:
-        task: that it is.
-        drawing, later: its image, and what it tells.
-    """
+    """A step that was submitted; called, it waits, and gives what the step told. later: what that is."""
 
     drawing: Drawing
     later: Later
@@ -100,7 +95,6 @@ class ResidentStep:
         self._ring = Ring(scene.device, _RING_BYTES)
         self._flying: deque[Flying] = deque()
         self._statistics_on_host = True
-        self.field_fitted = False
         self.settled = 0
         self.broken: Callable[[int | None], None] = lambda step: None
         self.tell: Callable[[Measured], None] = lambda measured: None
@@ -148,11 +142,6 @@ class ResidentStep:
         while len(self._flying) >= IN_FLIGHT:
             self._settle_first()
 
-    @property
-    def count(self) -> int:
-        """Number of Gaussians."""
-        return len(self._scene)
-
     def take(self, scheduled: Scheduled, began: Callable[[], None]) -> Flying:
         """Submit a step, after `make_room`; what it will have told. began: called when it is submitted."""
         task = self._task(scheduled, self._scene.sh_degree)
@@ -173,21 +162,20 @@ class ResidentStep:
         frequency_rate = frequencies.rate.at(step) if frequencies else 0.0
         color = red, green, blue
         task = Task(scheduled, before, drawn, view, color, time, sh_degree, rates, frequency_rate)
-        if scheduled.moving and self._passes.moves and step > self._config.smoothness.start:
-            self._draw(task, step, draws.generator)
+        if self._passes.moves:
+            self._draw(task, draws.generator)
         self._truth.prefetch([view, *draws.coming(AHEAD)])
         return task
 
-    def _draw(self, task: Task, step: int, generator: torch.Generator) -> None:
+    def _draw(self, task: Task, generator: torch.Generator) -> None:
         """Draw the samples of the losses of motion."""
-        smooth, even, count = self._config.smoothness, self._config.acceleration, self.count
-        near_count, even_count = round(smooth.share * count), round(even.share * count)
-        if near_count and (smooth.static or smooth.temporal):
-            task.near = Samples(near_count, count, *_draw_rows(count, generator), smooth.reach)
-            task.near_time = near_time(smooth, task.time, generator)
-        left_out = self.field_fitted or step % even.interval or not even.weight or self._time_count < 3
-        if even_count and not left_out:
-            task.even = Samples(even_count, count, *_draw_rows(count, generator))
+        config, count, fitted = self._config, len(self._scene), self._learners.field_fitted
+        near, even = compared_counts(config, task.scheduled, count, self._time_count, fitted=fitted)
+        if near:
+            task.near = Samples(near, count, *_draw_rows(count, generator), config.smoothness.reach)
+            task.near_time = near_time(config.smoothness, task.time, generator)
+        if even:
+            task.even = Samples(even, count, *_draw_rows(count, generator))
             task.even_times = even_times(task.time, self._time_count, generator)
 
     def _push(self) -> None:

@@ -25,12 +25,9 @@ def set_up(
 ) -> tuple[Config, Config, Dataset, Device]:
     """Check the arguments of a `Trainer`, open what they leave out, and resolve the configuration.
 
-    Returns:
-        The configuration with its field, that of the scene or of the parts where they bring one, and the place of its
-        steps decided, as config.toml holds it; the same resolved for the data, too; the capture; the device.
-
-    Raises:
-        InputError: the arguments do not fit each other.
+    Returns the configuration with its field, that of the scene or of the parts where they bring one, and the place of
+    its steps decided, as config.toml holds it; the same resolved for the data, too; the capture; the device. Raises
+    InputError where the arguments do not fit each other.
     """
     for name, kind, value in (("config", Config, config), ("dataset", Dataset | None, dataset)):
         if not isinstance(value, kind):

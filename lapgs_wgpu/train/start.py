@@ -27,17 +27,12 @@ MAX_HASH_RATE, MAX_MLP_RATE = 5e-3, 1e-3
 
 @dataclass(frozen=True)
 class Start:
-    """What a training starts with.
+    """What a training starts with: the first Gaussians, and the field.
 
-    Attributes:
-        scene: the first Gaussians, and the field.
-        warm_up_steps: number of the first steps without motion.
-        ramp_steps: number of the first steps over which the learning rates rise from 0.
-        field_fitted: whether the field knows nearly all that moves: its rates then stay low (`max_field_rates`), and
-            the acceleration loss is left out.
-        corrections: of the training cameras; None where they are as given.
-        summary: what discovery found, a sentence; None without discovery.
-        seconds: that discovery took.
+    warm_up_steps: number of the first steps without motion. ramp_steps: of those over which the learning rates rise
+    from 0. field_fitted: whether the field knows nearly all that moves: its rates then stay low (`max_field_rates`),
+    and the acceleration loss is left out. corrections: of the training cameras; None where they are as given. summary:
+    what discovery found, a sentence; None without discovery. seconds: that discovery took.
     """
 
     scene: Scene4D
@@ -52,14 +47,7 @@ class Start:
 def start_from_points(config: Config, dataset: Dataset, device: Device, own_field: nn.Module | None = None) -> Start:
     """Start from initial points, and without motion in the first `schedule.warm_up` steps.
 
-    Args:
-        config: resolved for the dataset.
-        dataset: the capture.
-        device: that trains.
-        own_field: of Scene4D.
-
-    Raises:
-        InputError: the configuration's field is `own`, and there is no module.
+    config: resolved for the dataset. Raises InputError where its field is `own`, and there is no module.
     """
     scene = Scene4D.from_points(
         *initial_points(config.points, dataset, config.seed),

@@ -10,13 +10,10 @@ from lapgs_wgpu.train.nonfinite import Skipped
 
 
 class Scheduled(NamedTuple):
-    """What the schedule says of a step.
+    """What the schedule says of a step, whose number is counted from 1.
 
-    Attributes:
-        step: its number, counted from 1.
-        moving: whether the field moves the Gaussians.
-        share: of the learning rates, which rise over the first steps.
-        seen: whether density control takes the views in.
+    moving: whether the field moves the Gaussians. share: of the learning rates, which rise over the first steps. seen:
+    whether density control takes the views in.
     """
 
     step: int

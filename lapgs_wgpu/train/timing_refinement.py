@@ -30,12 +30,8 @@ AROUND = 8  # images before and after one, whose median shift is the field's del
 class TimingRefinement:
     """How the timing of a scene is learnt: for the time of each image the time of the field that the image shows.
 
-    Args:
-        scene: whose timing it is.
-        views: of the training.
-        truth: the image of a view.
-        picture: the scene's picture (H, W, 3) of a view under a timing, which is compared with it.
-        gap: the usual distance in time of two images of a camera.
+    truth: the image of a view. picture: the scene's picture (H, W, 3) of a view under a timing, which is compared with
+    it. gap: the usual distance in time of two images of a camera.
     """
 
     def __init__(

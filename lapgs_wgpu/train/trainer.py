@@ -140,14 +140,6 @@ class Trainer:
         self._plans, camera = rasterizer_of(scene.device).plans, dataset.train[0].camera
         self._drawn = (camera.width, camera.height, True)  # the kind of images that the steps draw
         self._plans.set_bands(self._drawn, 1)
-        self._set_field_fitted(start.field_fitted)
-
-    def _set_field_fitted(self, field_fitted: bool) -> None:
-        """Say whether discovery has fitted the field to nearly all that moves."""
-        self._exchange.field_fitted = field_fitted
-        if self._resident is not None:
-            self._resident.field_fitted = field_fitted
-        self._learners.limit_field_rates(field_fitted=field_fitted)
 
     @property
     def cameras(self) -> CameraRefinement | None:
@@ -294,7 +286,7 @@ class Trainer:
                 "done": torch.tensor(self.done),
                 "warm_up": torch.tensor(self.warm_up_steps),
                 "rising": torch.tensor(self._ramp_steps),
-                "field_fitted": torch.tensor(int(self._exchange.field_fitted)),
+                "field_fitted": torch.tensor(int(self._learners.field_fitted)),
                 "sh_degree": torch.tensor(scene.sh_degree),
                 "random": self._generator.get_state(),
                 "order": torch.tensor(self._draws.left, dtype=torch.int64),
@@ -330,7 +322,7 @@ class Trainer:
         own = parts["training"]
         self.done, scene.sh_degree = int(own["done"]), int(own["sh_degree"])
         self.warm_up_steps, self._ramp_steps = int(own["warm_up"]), int(own["rising"])
-        self._set_field_fitted(bool(own["field_fitted"]))
+        self._learners.field_fitted = bool(own["field_fitted"])
         self._generator.set_state(own["random"])
         self._draws.left = own["order"].tolist()
         self._plans.set_bands(self._drawn, int(own["bands"]))

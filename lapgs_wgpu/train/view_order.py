@@ -21,10 +21,8 @@ class Mark(NamedTuple):
 class Draws:
     """What the steps of a training draw: views in random order without replacement, epoch after epoch.
 
-    Attributes:
-        generator: of all random numbers.
-        background: (3,) under every image; None for a new one in each step.
-        left: the numbers of the views that are still to come in this epoch.
+    background: (3,) under every image; None for a new one in each step. left: the numbers of the views that are still
+    to come in this epoch.
     """
 
     def __init__(self, views: Sequence[View], generator: torch.Generator, background: Tensor | None) -> None:

@@ -73,12 +73,10 @@ class Deformation(NamedTuple):
 
 
 class Deformed(NamedTuple):
-    """Gaussians at a time.
+    """Gaussians at a time, activated.
 
-    Attributes:
-        gaussians: activated.
-        smoothness: the weighted smoothness loss, if it was asked for.
-        at_times: means (M, 3) and scales (M, 3) of chosen Gaussians at each further time that was asked for.
+    smoothness: the weighted smoothness loss, if it was asked for. at_times: means (M, 3) and scales (M, 3) of chosen
+    Gaussians at each further time that was asked for.
     """
 
     gaussians: Gaussians[Tensor]

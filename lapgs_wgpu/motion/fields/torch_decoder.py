@@ -27,13 +27,9 @@ Result = TypeVar("Result")
 class DecoderWeights(NamedTuple):
     """Weights (outputs, inputs) and biases (outputs,) of the layers, float32; None: the field has no such layer.
 
-    Attributes:
-        spatial, spatial_bias: of the gate, halved, which is exact; reads static features.
-        temporal, dynamics, temporal_bias: of what the gate multiplies; reads temporal features and dynamics attributes.
-        inner, inner_bias: of the motion, rectified; reads static features.
-        heads: reads the gated channels.
-        motion_heads: reads the motion's inner channels.
-        heads_bias: of all heads.
+    spatial: of the gate, halved, which is exact; reads static features. temporal, dynamics: of what the gate
+    multiplies; read temporal features and dynamics attributes. inner: of the motion, rectified; reads static features.
+    heads: read the gated channels. motion_heads: read the motion's inner channels. heads_bias: of all heads.
     """
 
     spatial: Tensor
@@ -49,17 +45,11 @@ class DecoderWeights(NamedTuple):
 
 
 def decode(static: Tensor, temporal: Tensor | None, dynamics: Tensor | None, weights: DecoderWeights) -> Tensor:
-    """Return the outputs of the heads: with the layers' outputs x (spatial), y (temporal) and z (inner),
+    """Return the outputs (N, outputs) of the heads: with the layers' outputs x (spatial), y (temporal) and z (inner),
     relu(y) (2 sigmoid(x) - 1) heads^T + relu(z) motion_heads^T + heads_bias (Grid4D; paper eqs. 6 and 9).
 
-    Args:
-        static: (N, columns) features.
-        temporal: (N, columns) features; None without temporal grids.
-        dynamics: (N, D); None without.
-        weights: of all layers. All tensors have one dtype: float32, or float64 for a reference.
-
-    Returns:
-        (N, outputs).
+    static, temporal: (N, columns) features. dynamics: (N, D). All tensors have one dtype: float32, or float64 for a
+    reference.
     """
     outputs: Tensor = _Decode.apply(static, temporal, dynamics, *weights)
     return outputs

@@ -19,12 +19,9 @@ SH_FLOATS = 48
 
 
 class Line(NamedTuple):
-    """Samples before and after the time of a step, which should lie on a line.
+    """Samples before and after the time of a step, which should lie on a line with all Gaussians `now`.
 
-    Attributes:
-        now: all Gaussians at that time.
-        before, after: the samples.
-        scale: of the gradient: the loss's weight, divided by the number of samples.
+    scale: of the gradient: the loss's weight, divided by the number of samples.
     """
 
     now: Decoding

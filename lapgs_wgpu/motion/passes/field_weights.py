@@ -41,9 +41,8 @@ class Segment(NamedTuple):
 class Heads(NamedTuple):
     """The heads at a time, or the gradient of them.
 
-    Attributes:
-        weights: (outputs, features) of what the gate leaves and of the motion's inner layer.
-        biases: (20,), of which as many count as there are outputs.
+    weights: (outputs, features) of what the gate leaves and of the motion's inner layer. biases: (20,), of which as
+    many count as there are outputs.
     """
 
     weights: DeviceArray
@@ -53,13 +52,9 @@ class Heads(NamedTuple):
 class FieldWeights:
     """The weights of a field that `decodes_on_device`, and the passes from them to the heads and back.
 
-    Attributes:
-        width: channels of a layer.
-        dynamics, static, temporal: columns of the layers' inputs; the first and the last may be 0.
-        outputs: of the heads.
-        motion: whether there is the inner layer of the Laplacian motion.
-        places: by name of each parameter but the tables its place in the array of weights.
-        count: numbers of that array, the frequencies last.
+    width: channels of a layer. dynamics, static, temporal: columns of the layers' inputs; the first and the last may be
+    0. outputs: of the heads. motion: whether there is the inner layer of the Laplacian motion. places: by name of each
+    parameter but the tables its place in the array of weights. count: numbers of that array, the frequencies last.
     """
 
     def __init__(self, device: Device, config: FieldConfig) -> None:

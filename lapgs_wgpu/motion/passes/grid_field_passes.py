@@ -22,11 +22,8 @@ from lapgs_wgpu.motion.passes.samples import SamplePasses, Samples, Sampling
 class FieldArrays(NamedTuple):
     """What a field computes with, or the gradients of it.
 
-    Attributes:
-        geometry: (N, 12), as common/geometry.wgsl has it; its gradient is not the field's.
-        beside: (N, D + 1) dynamics attributes, then ones.
-        tables: (entries, 2) of each grid, the spatial one first.
-        weights: of `FieldWeights`.
+    geometry: (N, 12), as common/geometry.wgsl has it; its gradient is not the field's. beside: (N, D + 1) dynamics
+    attributes, then ones. tables: (entries, 2) of each grid, the spatial one first. weights: of `FieldWeights`.
     """
 
     geometry: DeviceArray
@@ -36,16 +33,11 @@ class FieldArrays(NamedTuple):
 
 
 class Decoding(NamedTuple):
-    """Gaussians at a time that were decoded.
+    """Gaussians at a time that were decoded. name: distinguishes them.
 
-    Attributes:
-        name: distinguishes it.
-        time: gives that of the field, in [0, 1].
-        sampling: gives those of the Gaussians; None for all, in their order.
-        points: of the encoder.
-        inputs: of the decoder.
-        heads: at that time.
-        outputs: (count, outputs) of the heads, without their biases; before `backward` they become their gradient.
+    time: gives that of the field, in [0, 1]. sampling: gives those of the Gaussians; None for all, in their order.
+    points, inputs: of encoder and decoder. heads: at that time. outputs: (count, outputs) of the heads, without their
+    biases; before `backward` they become their gradient.
     """
 
     name: str

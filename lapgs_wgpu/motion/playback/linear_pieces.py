@@ -51,15 +51,11 @@ class Pieces(NamedTuple):
 def linear_pieces(
     playback: Playback, farthest: float, shade: float, done: Callable[[float], object] = lambda share: None
 ) -> Pieces:
-    """Bake a playback.
+    """Bake a playback. Gaussians that no pass draws during a piece are left out of it.
 
-    Args:
-        farthest: largest distance, at the samples, of a point of an ellipsoid of one standard deviation from where the
-            playback has it, world units.
-        shade: largest change of opacity and color within a piece, both in [0, 1].
-        done: called with the share that is done, now and then.
-
-    Gaussians that no pass draws during a piece are left out of it.
+    farthest: largest distance, at the samples, of a point of an ellipsoid of one standard deviation from where the
+    playback has it, world units. shade: largest change of opacity and color within a piece, both in [0, 1]. done:
+    called with the share that is done, now and then.
     """
     found: list[tuple[Floats, ...]] = []
     size = _BLOCK // SAMPLES
