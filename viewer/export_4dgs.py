@@ -102,7 +102,6 @@ def _gaussian_set(pieces: Pieces, sh: NDArray[np.float32], seconds: float) -> An
 
 
 def _shown(scene: Any, device: Device) -> Written:
-    """Draw what the library read; its harmonics are of linear light."""
     gaussians = scene.gaussians
     light = harmonics_4dgs(gaussians)
 

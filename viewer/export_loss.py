@@ -127,7 +127,6 @@ def _errors(name: str, true: dict[str, Floats], found: dict[str, Floats], camera
 
 
 def _colors(means: Floats, sh: Floats, camera: Camera) -> Floats:
-    """(N, 3) colors from a camera, of harmonics (N, K, 3) or as they are."""
     return sh if sh.ndim == 2 else np.maximum(seen(means, sh, camera) + CONSTANTS["SH_OFFSET"], 0)
 
 

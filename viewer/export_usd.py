@@ -109,7 +109,6 @@ def _vt(pxr: Any, name: str, values: Floats) -> Any:
 
 
 def _write_camera(pxr: Any, stage: Any, scene: LoadedScene) -> None:
-    """The camera where the viewer begins."""
     view = scene.camera().camera(640, 480)
     camera = pxr.UsdGeom.Camera.Define(stage, "/World/Camera")
     pose = np.linalg.inv(view.T_cam_world) @ np.diag([1.0, -1, -1, 1])  # USD's cameras look along -z, with y up

@@ -209,7 +209,6 @@ def _slider_value() -> float:
 
 
 def _legend(low: float, high: float) -> None:
-    """Draw the scale of colors with the values at its ends."""
     x, y = imgui.get_cursor_screen_pos()
     width = imgui.get_content_region_avail().x
     step = width / (len(HEAT) - 1)
@@ -234,12 +233,10 @@ def _style() -> None:
 
 
 def _button(label: str, width: float = 66) -> bool:
-    """Draw a button; returns whether it was pressed."""
     return bool(imgui.button(label, (width, 0)))
 
 
 def _choice(label: str, present: T, choices: Sequence[T], names: Sequence[str] | None = None, width: float = -70) -> T:
-    """Draw a list; returns the choice, `present` until the user takes another. names: labels of the choices."""
     imgui.set_next_item_width(width)
     at = choices.index(present) if present in choices else -1
     changed, chosen = imgui.combo(label, at, list(map(str, choices if names is None else names)))
@@ -247,6 +244,5 @@ def _choice(label: str, present: T, choices: Sequence[T], names: Sequence[str] |
 
 
 def _tip(text: str) -> None:
-    """Show a text while the pointer rests on the last item."""
     if imgui.is_item_hovered(imgui.HoveredFlags_.allow_when_disabled):
         imgui.set_tooltip(text)

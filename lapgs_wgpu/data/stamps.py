@@ -128,7 +128,6 @@ def _word(name: str) -> str:
 def _places_of_each(
     names: Iterable[ImageName], places: Mapping[str, NDArray[np.float64]]
 ) -> list[list[NDArray[np.float64]]]:
-    """Group the known places by camera."""
     groups: dict[str, list[NDArray[np.float64]]] = {}
     for name in names:
         if name.file in places:
@@ -170,7 +169,6 @@ def _of_each(stamps: Sequence[str], read: Callable[[str], float | None]) -> list
 
 
 def _date(stamp: str) -> float | None:
-    """Seconds of a date and a time of day."""
     if not (found := _CLOCK.search(stamp)) or found["date"] is None or (clock := _time_of_day(found)) is None:
         return None
     try:

@@ -86,7 +86,6 @@ def check_plausible(frames: Sequence[Frame]) -> list[str]:
 
 
 def _black_cameras(frames: Sequence[Frame]) -> list[str]:
-    """Warn about cameras of a rig whose images show nothing."""
     by_camera = dict[str, list[ImageFile]]()
     for frame in frames:
         if frame.name.camera and isinstance(frame.image, ImageFile):
@@ -220,7 +219,6 @@ def check_times(dataset: Dataset, *, moving: bool) -> list[str]:
 
 
 def _gaps(dataset: Dataset, source: str) -> list[str]:
-    """Warn about the longest part of the clip [0, 1] without a training view."""
     edges = np.concatenate([[0.0], dataset.times, [1.0]])
     gaps, usual = np.diff(edges), float(np.median(np.diff(dataset.times)))
     longest = int(np.argmax(gaps))

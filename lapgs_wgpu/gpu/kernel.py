@@ -119,7 +119,6 @@ class Kernel:
 
 
 def _scalar(binding: Binding) -> str | None:
-    """Return the scalar type of a binding's elements, f32, u32 or i32; None for structs."""
     if binding.kind == "uniform":
         return None
     if binding.kind == "texture":

@@ -16,8 +16,6 @@ _TOGETHER = 128  # uniforms in a buffer
 
 
 class _Uniforms:
-    """Uniforms beside each other in one buffer."""
-
     def __init__(self, device: Device) -> None:
         self.array = DeviceArray.empty(device, "uniforms", (_TOGETHER * _APART,), "uint8")
         self._content, self._used = bytearray(_TOGETHER * _APART), 0

@@ -237,7 +237,6 @@ def struct_layout(source: str, struct_name: str) -> tuple[int, dict[str, tuple[i
 
 
 def _members(source: str, struct_name: str) -> list[tuple[str, str]]:
-    """Name and type of each member of a struct."""
     body = re.search(rf"struct\s+{struct_name}\s*{{(.*?)}}", source, re.S)
     if body is None:
         raise ShaderError(f"no struct {struct_name} in the shader")

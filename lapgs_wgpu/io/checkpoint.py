@@ -68,7 +68,6 @@ def read_checkpoint(path: PathLike) -> Checkpoint:
 
 
 def _read_motion(ply: PlyFile) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
-    """Tensors and metadata in the element `lapgs4d`. Raises InputError."""
     element, where = ply.elements[_ELEMENT], f"{ply.path}: element {_ELEMENT}"
     pattern = rf"^{_ELEMENT} v([0-9]{{1,9}}) safetensors ([0-9]{{1,18}})$"
     declared = re.search(pattern, "\n".join(ply.comments), re.MULTILINE)

@@ -194,14 +194,11 @@ def _named(name: str, quantized: Quantized) -> dict[str, NDArray[Any]]:
 
 
 def _table_starts(config: FieldConfig) -> list[int]:
-    """Return the first entries of the levels of a temporal grid."""
     grids = temporal_grids(config)
     return [level.first for level in grids[0].levels] if grids else [0]
 
 
 class _Reader:
-    """Tensors by name, checked."""
-
     def __init__(self, tensors: Mapping[str, NDArray[Any]], where: str) -> None:
         self._tensors, self._where = tensors, where
 

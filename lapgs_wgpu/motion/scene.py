@@ -225,7 +225,6 @@ class Scene4D:
         return [move, *(field(rows[0], time, rows[1]) for time in time_samples.times)]
 
     def _moved(self, move: Deformation, means: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
-        """Means and scales after a move."""
         if move.d_scales is not None:
             scales = scales + move.d_scales
             if self.field_config.negative_scales == "mirror":

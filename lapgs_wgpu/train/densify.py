@@ -162,7 +162,6 @@ def split_rows(parents: Rows, generator: torch.Generator) -> dict[str, Tensor]:
 
 
 def _faint(rows: Rows, config: DensityConfig) -> Tensor:
-    """(N,) bool: Gaussians that are too faint."""
     return rows["opacity_logits"] < _logit(config.min_opacity)
 
 

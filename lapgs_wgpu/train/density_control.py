@@ -81,7 +81,6 @@ class DensityControl:
         self.statistics = Statistics.zeros(len(scene))
 
     def _prune_hidden(self, moving: bool) -> None:
-        """Prune the Gaussians that contribute too little to all images."""
         views = [dataclasses.replace(view, camera=self._camera_of(view)) for view in self._views]
         most = contributions(self._scene, views, moving=moving)
         keep = (most >= self._config.min_contribution) | largest(most, LEAST_KEPT)

@@ -90,12 +90,10 @@ def evaluate(
 
 
 def _on(color: Tensor, view: View) -> NDArray[np.uint8]:
-    """The ground truth of a view on a background: (H, W, 3)."""
     return composite(view.load(), color.numpy())
 
 
 def _render(scene: Scene4D, view: View, color: Tensor) -> NDArray[np.uint8]:
-    """The rendering of a view on a background: (H, W, 3)."""
     return to_8_bit(scene.render(view.camera, view.time, color, depth=False).image)
 
 

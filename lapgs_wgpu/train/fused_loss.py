@@ -44,8 +44,6 @@ class RenderLoss(NamedTuple):
 
 
 class _Comparison(NamedTuple):
-    """What `_FusedLoss` takes besides tensors; see `render_loss`."""
-
     camera: Camera
     camera_unit: float
     antialiased: bool

@@ -112,8 +112,6 @@ class _Level(NamedTuple):
 
 
 class _Frame:
-    """One image's passes while they are recorded."""
-
     def __init__(
         self,
         owner: ImageLoss,

@@ -95,7 +95,6 @@ class Log:
         return steps / max(self._times[-1] - since, 1e-9)
 
     def _means(self) -> dict[str, Any]:
-        """Loss, PSNR and loss terms in the mean over the last steps."""
         count = len(self._recent)
         terms = Counter[str]()
         for each in self._recent:

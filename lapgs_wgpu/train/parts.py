@@ -48,7 +48,6 @@ class Parts:
     callbacks: Sequence[Callback] = ()
 
     def __post_init__(self) -> None:
-        """Raises InputError for losses and rates of another kind."""
         names = Counter(TAKEN_NAMES)
         for term in self.losses:
             if not isinstance(term, LossTerm):
@@ -67,10 +66,15 @@ class Parts:
     def rates_of(
         self, configured: Mapping[str, Rate], gaussians: Collection[str], groups: Collection[str]
     ) -> dict[str, Rate]:
-        """The learning rate of each group of parameters: those of the configuration, and one's own in their place.
+        """The learning rate of each group of parameters, by name.
 
-        gaussians, groups: names of the Gaussians' parameters, and of the field's groups. Raises InputError where a
-        group has no rate, or the name of other parameters, or a rate has no group.
+        Args:
+            configured: those of the configuration.
+            gaussians: names of the Gaussians' parameters.
+            groups: names of the field's groups.
+
+        Raises:
+            InputError: a group has no rate, or the name of other parameters, or a rate has no group.
         """
         own = {name: rate if isinstance(rate, Rate) else Rate(rate, rate, 1) for name, rate in self.rates.items()}
         rates = {**configured, **own}

@@ -171,7 +171,6 @@ def _read_file(path: str) -> Table:
 
 
 def _read_packaged(name: str) -> Table:
-    """The table of a preset that comes with the package."""
     presets = _packaged()
     if name not in presets:
         names = preset_names()

@@ -106,7 +106,6 @@ class ResidentPasses:
         self.rasterizer.backward(drawing, d_image)
 
     def _recorded(self, commands: Commands, task: Task, truth: DeviceArray, *, judged: bool) -> Recorded:
-        """Record a step's passes, or replay those of one of the same shape."""
         camera, plan = task.view.camera, self.rasterizer.plan_of(task.view.camera)
         shape = (
             *(task.scheduled.moving, task.scheduled.seen, task.near is None, task.even is None, judged),

@@ -154,7 +154,6 @@ class ResidentStep:
         return flying
 
     def _task(self, scheduled: Scheduled, sh_degree: int) -> Task:
-        """Draw what a step looks at."""
         step, draws, frequencies = scheduled.step, self._draws, self._learners.frequencies
         before, (view, background), drawn = draws.mark(), draws.next(), draws.mark()
         red, green, blue = background.tolist()
@@ -168,7 +167,6 @@ class ResidentStep:
         return task
 
     def _draw(self, task: Task, generator: torch.Generator) -> None:
-        """Draw the samples of the losses of motion."""
         config, count, fitted = self._config, len(self._scene), self._learners.field_fitted
         near, even = compared_counts(config, task.scheduled, count, self._time_count, fitted=fitted)
         if near:

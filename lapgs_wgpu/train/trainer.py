@@ -102,7 +102,6 @@ class Trainer:
         self.whole = True
 
     def _prepare(self, start: Start) -> None:
-        """Make what the steps work with."""
         config, scene, dataset, extent = self.config, self.scene, self.dataset, self.dataset.extent
         self._color = torch.full((3,), BACKGROUND_LEVELS[config.data.background])  # of measurements
         color = None if config.data.background == "random" else self._color
@@ -170,7 +169,6 @@ class Trainer:
         self.close()
 
     def __iter__(self) -> Iterator[StepResult]:
-        """Take the steps that are left, one at a time."""
         while self.done < self.config.schedule.steps:
             yield self.step()
 

@@ -71,7 +71,6 @@ def _models(folder: Path) -> list[Path]:
 
 
 def _image_files(images: Path) -> list[str]:
-    """All image files below images/, by their relative paths."""
     files = []
     entered: set[str] = set()
     for parent, folders, names in os.walk(images, followlinks=True):

@@ -95,7 +95,6 @@ def read_model(folder: Path) -> ColmapModel:
 
 
 def _camera(where: str, model: str, width: float, height: float, values: list[float]) -> Lens:
-    """Check the values of a camera. Raises InputError."""
     if model not in PARAMETERS:
         cut = "cut pinhole views out of the panoramas"
         advice = cut if model == "EQUIRECTANGULAR" else "undistort the images with colmap image_undistorter"
@@ -200,8 +199,6 @@ def _points(rows: Sequence[Sequence[float]]) -> tuple[Array, NDArray[np.uint8]]:
 
 
 class _Bytes:
-    """A binary file in memory, and the position up to which it was read."""
-
     def __init__(self, path: Path) -> None:
         self.path, self.at, self.data = path, 0, path.read_bytes()
 

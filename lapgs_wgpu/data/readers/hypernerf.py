@@ -98,7 +98,6 @@ def _splits(data: Fields) -> tuple[list[str], list[str], list[str]]:
 
 
 def _times(metadata: Fields, ids: Sequence[str]) -> dict[str, int]:
-    """Return the time_id or warp_id of each id."""
     entries = {name: as_fields(metadata.required(name), f"{metadata.where}: {name}") for name in ids}
     field = "time_id" if any("time_id" in entry for entry in entries.values()) else "warp_id"
     return {name: int(entry.number(field, 0)) for name, entry in entries.items()}

@@ -71,7 +71,6 @@ def _read_split(folder: Path, data: Fields, split: Split, warnings: list[str]) -
 
 
 def _lens(k: object, width: int, height: int, where: str) -> Lens:
-    """The pinhole of a field k. Raises InputError."""
     K = matrix(k, (3, 3), "k", where)
     if not ((np.diag(K)[:2] > 0).all() and (np.abs(K) <= LARGEST_INTRINSIC).all()):
         raise InputError(f"{where}: k must hold focal lengths from 0 to {LARGEST_INTRINSIC:g} pixels.")

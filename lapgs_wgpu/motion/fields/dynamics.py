@@ -27,7 +27,6 @@ def dynamics_loss(d: Tensor) -> Tensor:
 
 
 def _offsets(d: Tensor) -> Tensor:
-    """Return each row less the mean row, (N, D)."""
     return d - d.detach().mean(dim=0)
 
 

@@ -56,8 +56,6 @@ def decode(static: Tensor, temporal: Tensor | None, dynamics: Tensor | None, wei
 
 
 class _Inputs(NamedTuple):
-    """The inputs of `decode`, or their gradients."""
-
     static: Tensor
     temporal: Tensor | None
     dynamics: Tensor | None

@@ -102,7 +102,6 @@ class DecoderPasses:
         return Matrix.of(inputs[product.input].rows(first, count)).from_column(0, product.columns)
 
     def _weights(self, array: DeviceArray, product: _Product) -> Matrix:
-        """The weights of a product (channels, columns), or the gradient of them."""
         row = self._of.places[product.parameter].shape[1]
         whole = self._of.matrix(array, product.parameter, product.channels, row)
         return whole.from_column(product.column, product.columns)

@@ -123,7 +123,6 @@ class GridFieldPlayback:
         return _Block(first, count, **{name: self._pool.upload(f"{name} from {first}", a) for name, a in named.items()})
 
     def _encode_static(self, entries: Floats) -> None:
-        """Compute the spatial features H_s."""
         row = _CANONICAL + 4 * self._sizes.still_quads
         encoder = HashEncoderPasses(
             self._device, [static_grid(self._config)], self._config.bound, row=row, column=_CANONICAL
