@@ -63,7 +63,7 @@ def add(device: Device) -> Kernel:
 
 def test_missing_and_unknown_arrays_are_named(device: Device, wgsl: dict[str, str]) -> None:
     a = numbers(device, [1])
-    expected = r"shaders/add\.wgsl: missing arrays \['sum'\], unknown arrays \['summ'\]"
+    expected = r"shaders/add\.wgsl: missing arrays \['sum'\], unknown \['summ'\]"
     with Commands(device) as commands, pytest.raises(ShaderError, match=expected):
         commands.dispatch(add(device), 1, a=a, summ=a)
 
@@ -86,7 +86,7 @@ def test_a_binding_beyond_the_limit_is_refused(device: Device, wgsl: dict[str, s
 
 def test_a_buffer_beyond_the_limit_is_refused(device: Device) -> None:
     limit = device.limits["max-buffer-size"]
-    with pytest.raises(MemoryError, match=f"buffer 'huge' needs .* bytes, but a buffer of this device holds {limit}"):
+    with pytest.raises(MemoryError, match=f"buffer 'huge' needs .* bytes, and one of this device holds {limit}"):
         Buffer(device, limit + 1, "huge")
 
 
@@ -325,7 +325,7 @@ def test_types_and_shapes_are_kept(either: Device) -> None:
     assert array.rows(0, 0).read().shape == (0, 3)
     np.testing.assert_array_equal(array.read(), values)
     for wrong in (values.astype(np.float64), values[:6], values.view(np.uint32)):
-        with pytest.raises(ValueError, match=r"values: .* is not float32 of \(7, 3\)"):
+        with pytest.raises(ValueError, match=r"values: .* is not float32 \(7, 3\)"):
             array.write(wrong)
 
 

@@ -35,12 +35,8 @@ def find_view(scene: LoadedScene, wanted: str) -> View:
     """The view of the capture with this name, or number in the order of `capture_views`. Raises InputError."""
     views = capture_views(scene)
     if not views:
-        raise InputError(
-            f"--view {wanted}: {scene.path} stands beside no config.toml that names a capture which is here."
-        )
+        raise InputError(f"--view {wanted}: beside {scene.path} is no config.toml that names a capture which is here.")
     by_name = {str(number): view for number, view in enumerate(views)} | {view.name: view for view in views}
     if wanted not in by_name:
-        raise InputError(
-            f"--view {wanted}: the capture has views 0 to {len(views) - 1}, {views[0].name} to {views[-1].name}."
-        )
+        raise InputError(f"--view {wanted}: views are 0 to {len(views) - 1}, {views[0].name} to {views[-1].name}.")
     return by_name[wanted]

@@ -90,9 +90,7 @@ def export_compact(scene: LoadedScene, file: Path) -> Loss:
     Raises InputError where it cannot be written, and where only torch evaluates the field.
     """
     if scene.file is None:
-        raise InputError(
-            f"{scene.path}: holds no field of lapgs_wgpu; --export takes a folder, or a .ply, .usd or .4dgs."
-        )
+        raise InputError(f"{scene.path}: holds no field of lapgs_wgpu; --export a folder, a .ply, .usd or .4dgs.")
     with atomic_write(file) as target:  # before a minute of work
         content, loss = _compact(scene, scene.file)
         if file.suffix.lower() == ".html":

@@ -70,9 +70,7 @@ def parse_options(arguments: Sequence[str]) -> tuple[Any, str]:
         ending = ".usd" if ending in USD else ending
         place = f"--export FILE{ending}" if f"--export FILE{ending}" in _TAKES else "--export DIR"
         if place == "--export DIR" and given.frames is None:
-            raise InputError(
-                f"--export {given.export}: name a .ply, .lapgs, .html, .4dgs, .usd, or a folder and its --frames."
-            )
+            raise InputError(f"--export {given.export}: name a .ply, .lapgs, .html, .4dgs, .usd, or DIR and --frames.")
     for name, value in vars(given).items():
         if value is not None and name not in {"file", "device", job} | _TAKES[place]:
             raise InputError(f"{_option(name)} has no use with {place}.")

@@ -34,9 +34,7 @@ def check_rotation(R: Array, name: str) -> None:
             f"{ROTATION_TOLERANCE:g} is allowed), its axes have lengths {axes}; remove scale and shear."
         )
     if np.linalg.det(R) < 0:
-        raise InputError(
-            f"{name} is left-handed (determinant -1, must be 1); its axes are not the format's: export it again."
-        )
+        raise InputError(f"{name} is left-handed (determinant -1): its axes are not the format's; export it again.")
 
 
 def unit_quaternion(quaternion: Array, where: str) -> Array:

@@ -176,9 +176,7 @@ def check_cloud(cloud: Cloud, cameras: Sequence[Camera], path: Path, warnings: l
         warnings.append(f"{told}: of {len(points)}, {len(points) - seen.sum()} are left out.")
         return Cloud(cloud.points[seen], cloud.colors[seen])
     if len(points) > 1 and spread < MIN_SPREAD * distance:
-        raise InputError(
-            f"{path} is a speck: {numbers}; it has another scale than the cameras, so scale it to theirs or remove it."
-        )
+        raise InputError(f"{path} is a speck: {numbers}; scale it to the cameras, or remove it.")
     return cloud
 
 

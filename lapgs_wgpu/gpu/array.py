@@ -73,9 +73,7 @@ class DeviceArray:
     def write(self, values: NDArray[Any]) -> None:
         """Copy values of the array's dtype and shape to the device. Raises ValueError for others."""
         if values.dtype.name != self.dtype or values.shape != self.shape:
-            raise ValueError(
-                f"{self.buffer.label}: {values.dtype} of shape {values.shape} is not {self.dtype} of {self.shape}"
-            )
+            raise ValueError(f"{self.buffer.label}: {values.dtype} {values.shape} is not {self.dtype} {self.shape}")
         self.buffer.write(values, self.offset)
 
     def read(self) -> NDArray[Any]:

@@ -83,9 +83,7 @@ class Buffer:
         self.nbytes = max(16, (nbytes + 15) & ~15)
         if self.nbytes > device.limits["max-buffer-size"]:
             limit = device.limits["max-buffer-size"]
-            raise DeviceMemoryError(
-                f"buffer {label!r} needs {self.nbytes} bytes, but a buffer of this device holds {limit}"
-            )
+            raise DeviceMemoryError(f"buffer {label!r} needs {self.nbytes} bytes, and one of this device holds {limit}")
         self.wgpu_buffer = self._create(_STORAGE | (_MAPPABLE if device.mappable else 0))
         self.number = next(_numbers)  # unique, also among freed buffers
         # Bind groups keep device memory alive: they are dropped with the buffer.

@@ -84,9 +84,7 @@ class Kernel:
         if an array is too large for a binding."""
         if arrays.keys() != self.bindings.keys():
             missing, unknown = self.bindings.keys() - arrays.keys(), arrays.keys() - self.bindings.keys()
-            raise ShaderError(
-                f"shaders/{self.name}.wgsl: missing arrays {sorted(missing)}, unknown arrays {sorted(unknown)}"
-            )
+            raise ShaderError(f"shaders/{self.name}.wgsl: missing arrays {sorted(missing)}, unknown {sorted(unknown)}")
         for name, array in arrays.items():
             if not isinstance(array, DeviceArray):
                 raise ShaderError(f"shaders/{self.name}.wgsl: {name} must be a DeviceArray, got {type(array).__name__}")

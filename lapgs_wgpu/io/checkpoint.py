@@ -78,13 +78,8 @@ def _read_motion(ply: PlyFile) -> tuple[dict[str, NDArray[Any]], dict[str, str]]
         )
     version, size = int(declared[1]), int(declared[2])
     if version != VERSION:
-        raise InputError(
-            f"{where} has version {version}, and this program reads version {VERSION}; use the program that wrote the "
-            "file"
-        )
+        raise InputError(f"{where} has version {version}, and this program reads {VERSION}; use the one that wrote it")
     if not 0 <= 4 * element.count - size < 4:
-        raise InputError(
-            f"{where} declares {size} bytes of safetensors in {element.count} words of 4 bytes; the file is damaged"
-        )
+        raise InputError(f"{where} declares {size} bytes in {element.count} words of 4 bytes; the file is damaged")
     ply.file.seek(element.offset)
     return unpack_tensors(ply.file, size, where)

@@ -62,9 +62,7 @@ def read_lapgs(path: PathLike) -> tuple[dict[str, NDArray[Any]], dict[str, str]]
 def unpack_lapgs(data: bytes, where: str) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
     """As `read_lapgs`, of the bytes of a file. where: begins the message of an InputError."""
     if len(data) < _HEADER.size or not data.startswith(MAGIC):
-        raise InputError(
-            f"{where}: is not a compact scene: it lacks the header of {_HEADER.size} bytes; the file is damaged"
-        )
+        raise InputError(f"{where}: lacks the header of a compact scene ({_HEADER.size} bytes); the file is damaged")
     _, version, size = _HEADER.unpack_from(data)
     packed = len(data) - _HEADER.size
     if not 1 <= version <= VERSION:

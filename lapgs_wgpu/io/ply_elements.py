@@ -83,7 +83,7 @@ class PlyFile(NamedTuple):
             rows = np.fromfile(self.file, layout, min(size, element.count - start))
             if start + len(rows) < min(start + size, element.count):
                 raise InputError(
-                    f"{self.path}: became shorter while it was read, at row {start + len(rows)} of {element.count}."
+                    f"{self.path}: shrank while it was read, to {start + len(rows)} of {element.count} rows."
                 )
             yield start, rows
 
@@ -92,8 +92,7 @@ class PlyFile(NamedTuple):
         lines = self.file.read().decode(errors="replace").splitlines()[element.offset :][: element.count]
         if len(lines) < element.count:
             raise InputError(
-                f"{self.path}: declares {element.count} rows of {element.name}, but {len(lines)} lines follow; it is "
-                "truncated."
+                f"{self.path}: declares {element.count} rows of {element.name}, and {len(lines)} follow; it is cut off."
             )
         layout = np.dtype([(name, np.float64) for name in element.properties])
         table = np.empty(element.count, layout)
@@ -136,9 +135,7 @@ def _read_header(file: BinaryIO, path: PathLike) -> PlyFile:
             raise InputError(f"{path}: is a pointer of Git LFS in place of the file; fetch it by git lfs pull.")
         ending = Path(path).suffix.lower()
         if ending in SPLATS:
-            raise InputError(
-                f"{path}: is a {ending} file, which is not read; splat-transform or SuperSplat converts it."
-            )
+            raise InputError(f"{path}: is a {ending} file, which is not read; splat-transform converts it.")
         if head.startswith(b"\x1f\x8b"):
             raise InputError(f"{path}: is packed by gzip; unpack it.")
         raise InputError(
@@ -228,8 +225,5 @@ def _place(
             )
     file.seek(end)
     if not text and file.read(3) not in (b"", b"\n", b"\r\n"):  # some programs append a line's end
-        raise InputError(
-            f"{path}: its header declares {end} bytes, but the file has {size}: a count is wrong or something was "
-            "appended."
-        )
+        raise InputError(f"{path}: its header declares {end} bytes, and the file has {size}: a count in it is wrong.")
     return placed

@@ -63,9 +63,7 @@ def unpack_tensors(file: BinaryIO, size: int, where: str) -> tuple[dict[str, Arr
     length = int.from_bytes(file.read(8), "little")
     limit = min(size - 8, MAX_HEADER_BYTES)
     if length > limit:
-        raise InputError(
-            f"{where}: declares a header of {length} bytes, of at most {limit}; the file is damaged, or no .safetensors"
-        )
+        raise InputError(f"{where}: declares a header of {length} bytes, of at most {limit}; the file is damaged")
     header = _parse_json(file.read(length), where)
     metadata = header.pop(_METADATA, {})
     if not isinstance(metadata, dict) or not all(isinstance(text, str) for text in metadata.values()):

@@ -36,9 +36,7 @@ class Camera:
         object.__setattr__(self, "K", np.asarray(self.K, dtype=np.float64))
         object.__setattr__(self, "T_cam_world", np.asarray(self.T_cam_world, dtype=np.float64))
         if self.K.shape != (3, 3) or self.T_cam_world.shape != (4, 4):
-            raise ValueError(
-                f"Camera needs K of (3, 3) and T_cam_world of (4, 4), got {self.K.shape} and {self.T_cam_world.shape}"
-            )
+            raise ValueError(f"Camera needs K (3, 3), T_cam_world (4, 4), got {self.K.shape}, {self.T_cam_world.shape}")
         if not (np.isfinite(self.K).all() and np.isfinite(self.T_cam_world).all()):
             raise ValueError("Camera: K and T_cam_world must be finite")
         if not 0 <= self.near < math.inf:

@@ -113,9 +113,7 @@ def check_change(change: Change, rows: Rows) -> None:
     for name, row in change.added.items():
         expected = (born, *rows[name].shape[1:])
         if row.shape != expected or row.dtype != rows[name].dtype:
-            raise InputError(
-                f"added[{name!r}] must be float32 of shape {expected}, got {row.dtype} {tuple(row.shape)}."
-            )
+            raise InputError(f"added[{name!r}] must be float32 {expected}, got {row.dtype} {tuple(row.shape)}.")
 
 
 @torch.no_grad()

@@ -73,9 +73,7 @@ class DensityControl:
         change = self._rule(state)
         check_change(change, rows)
         if not change.keep.any() and len(change.added["means"]) == 0:
-            raise InputError(
-                f"density control leaves no Gaussian at step {step}; raise density.max_world_size (0 switches it off)."
-            )
+            raise InputError(f"no Gaussian is left at step {step}; raise density.max_world_size (0 switches it off).")
         self._optimizer.edit_rows(change.keep, change.added)
         self._optimizer.edit_rows(morton_order(scene.parameters["means"].detach()))
         self.statistics = Statistics.zeros(len(scene))

@@ -76,9 +76,7 @@ def torch_loss(
         shown = torch.from_numpy(planes[:3]).permute(1, 2, 0).requires_grad_()
         value = term.function(shown, torch.where(left_out, shown.detach(), target))
         if not isinstance(value, Tensor) or value.ndim:
-            raise InputError(
-                f"the loss {term.name!r} must return a scalar tensor, got {getattr(value, 'shape', value)}."
-            )
+            raise InputError(f"the loss {term.name!r} must return a scalar, got {getattr(value, 'shape', value)}.")
         gradient = torch.zeros_like(shown)
         if value.requires_grad:
             (found,) = torch.autograd.grad(value, shown, allow_unused=True)

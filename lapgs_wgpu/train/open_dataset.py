@@ -16,9 +16,7 @@ def resolve_data(config: Config, scenes: Path) -> Config:
     unless it is there. Raises InputError."""
     path = config.data.path
     if not path:
-        raise InputError(
-            f"the configuration names no data; give --data DIR (in Python data.path), or take {SYNTHETIC}."
-        )
+        raise InputError(f"the configuration names no data; give --data DIR (in Python data.path), or {SYNTHETIC}.")
     folder = write_built_in(scenes / SYNTHETIC) if path == SYNTHETIC else Path(path)
     masks = str(Path(config.data.masks).resolve()) if config.data.masks else ""
     return dataclasses.replace(config, data=dataclasses.replace(config.data, path=str(folder.resolve()), masks=masks))

@@ -58,10 +58,7 @@ class Parts:
         for name, rate in self.rates.items():
             number = isinstance(rate, int | float) and 0 <= rate < math.inf
             if not number and not isinstance(rate, Rate):
-                raise InputError(
-                    f"Parts(rates=...) gives {name} the rate {rate!r}; give a number of at least 0, or a "
-                    "Rate(start, end, steps)."
-                )
+                raise InputError(f"Parts(rates=...) gives {name} {rate!r}; give 0 or more, or Rate(start, end, steps).")
 
     def rates_of(
         self, configured: Mapping[str, Rate], gaussians: Collection[str], groups: Collection[str]
@@ -80,9 +77,7 @@ class Parts:
         rates = {**configured, **own}
         for name in groups:
             if name in gaussians or name == FrequencyOptimizer.name:
-                raise InputError(
-                    f"the field's group {name} has the name of parameters of the training's own; give it another."
-                )
+                raise InputError(f"the field's group {name} has the name of the training's own parameters; rename it.")
             if name not in rates:
                 raise InputError(f"the field's group {name} has no learning rate; give Parts(rates={{{name!r}: ...}}).")
         for name in own:

@@ -43,13 +43,9 @@ def check_run_folder(out: Path, *, overwrite: bool) -> None:
         return
     if not overwrite:
         goes_on = ", go on with its interrupted run with --resume" if (out / STATE).is_file() else ""
-        raise InputError(
-            f"{out} is not empty; name another folder with --out{goes_on}, or replace its run with --overwrite."
-        )
+        raise InputError(f"{out} is not empty; name another with --out{goes_on}, or replace its run with --overwrite.")
     if not (out / "config.toml").is_file() or not (_recorded(out) or (out / "log.jsonl").is_file()):
-        raise InputError(
-            f"{out} holds files, but no run that --overwrite could replace; name another folder with --out."
-        )
+        raise InputError(f"{out} holds files, but no run that --overwrite could replace; name another with --out.")
 
 
 def start_run_folder(out: Path, config: Config, device: Device, dataset: Dataset) -> None:

@@ -47,9 +47,7 @@ def _read_record3d(folder: Path, image_size: int | None) -> Capture:
     files = {int(file.stem): file for file in pictures if file.stem.isascii() and file.stem.isdigit()}
     poses = data.entries("poses")
     if max(files) >= len(poses):
-        raise InputError(
-            f"{path} has {len(poses)} poses, but there is {files[max(files)]}; frame i needs the pose i: export again."
-        )
+        raise InputError(f"{path} has {len(poses)} poses, but there is {files[max(files)]}; export them again.")
     if data.values.get(timed := "frameTimestamps"):
         times = data.entries(timed, len(poses))
     else:

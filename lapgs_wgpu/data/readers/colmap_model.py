@@ -83,13 +83,12 @@ def read_model(folder: Path) -> ColmapModel:
     for image in images:
         if image.camera not in cameras:
             raise InputError(
-                f"{image.where} was taken by camera {image.camera}, which is not among the {len(cameras)} of "
-                f"{files['cameras']}."
+                f"{image.where} names camera {image.camera}, none of {len(cameras)} in {files['cameras']}."
             )
     bad = np.flatnonzero(~(np.abs(points) <= LARGEST_ENTRY).all(axis=1))  # true for NaN, too
     if len(bad):
         raise InputError(
-            f"{files['points3D']}: {len(bad)} of {len(points)} points are not finite, first {bad[0]}; remove them."
+            f"{files['points3D']}: {len(bad)} of {len(points)} are not finite, first {bad[0]}; remove them."
         )
     return ColmapModel(cameras, images, points, colors, *files.values())
 
@@ -98,18 +97,12 @@ def _camera(where: str, model: str, width: float, height: float, values: list[fl
     if model not in PARAMETERS:
         cut = "cut pinhole views out of the panoramas"
         advice = cut if model == "EQUIRECTANGULAR" else "undistort the images with colmap image_undistorter"
-        raise InputError(
-            f"{where}: its model {model[:40]} is not among those that are read ({', '.join(PARAMETERS)}); {advice}."
-        )
+        raise InputError(f"{where}: its model {model[:40]} is none that is read ({', '.join(PARAMETERS)}); {advice}.")
     names = PARAMETERS[model]
     if len(values) != len(names):
-        raise InputError(
-            f"{where}: a {model} has {len(names)} parameters ({', '.join(names)}), but there are {len(values)}."
-        )
+        raise InputError(f"{where}: a {model} has {len(names)} parameters ({', '.join(names)}), not {len(values)}.")
     if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE):
-        raise InputError(
-            f"{where}: width and height must be 1 to {LARGEST_SIDE:g} pixels, got {shown(width)}x{shown(height)}."
-        )
+        raise InputError(f"{where}: sides must be 1 to {LARGEST_SIDE:g} pixels, got {shown(width)}x{shown(height)}.")
     for name, value in zip(names, values, strict=True):
         if not abs(value) <= LARGEST_INTRINSIC or (name[0] == "f" and value <= 0):  # true for NaN, too
             raise InputError(f"{where}: {name} is {value:g}, which no camera has.")

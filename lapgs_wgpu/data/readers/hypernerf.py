@@ -91,9 +91,7 @@ def _splits(data: Fields) -> tuple[list[str], list[str], list[str]]:
         raise InputError(f"{data.where}: {len(train)} train_ids and {len(test)} test ids; at least one of each.")
     for field, names in (("train_ids", train), ("val_ids", test)):
         for name in set(names) - set(ids):
-            raise InputError(
-                f"{data.where}: {field} names {name}, which is not among its {len(ids)} ids; add it there."
-            )
+            raise InputError(f"{data.where}: {field} names {name}, none of its {len(ids)} ids; add it there.")
     return ids, train, test
 
 
@@ -153,13 +151,9 @@ def _names(data: Fields, field: str) -> list[str]:
     names = data.entries(field)
     for name in names:
         if not isinstance(name, str) or not re.fullmatch(r"\w[\w.-]{0,99}", name):
-            raise InputError(
-                f"{data.where}: {field} holds {kind(name)}, which is no id (letters, digits and . _ - only)."
-            )
+            raise InputError(f"{data.where}: {field} holds {kind(name)}, no id (letters, digits and . _ - only).")
     if len(set(names)) < len(names):
-        raise InputError(
-            f"{data.where}: {field} holds {len(names)} ids of which {len(set(names))} differ; name each once."
-        )
+        raise InputError(f"{data.where}: {field} holds {len(names)} ids, {len(set(names))} different; name each once.")
     return names
 
 

@@ -63,10 +63,7 @@ def _read_rows(path: Path, names: Sequence[str], what: str, axes: Array) -> list
     """
     rows = read_npy(path).astype(np.float64)
     if rows.ndim != 2 or rows.shape[1] != 17:
-        raise InputError(
-            f"{path} must hold 17 numbers a pose, an array of (poses, 17), got {rows.shape}; write it with LLFF's "
-            "imgs2poses.py."
-        )
+        raise InputError(f"{path} must hold (poses, 17) numbers, got {rows.shape}; write it with LLFF's imgs2poses.py.")
     if len(rows) != len(names):
         raise InputError(
             f"{path} holds {len(rows)} poses, but there are {len(names)} {what}, {names[0]} to {names[-1]}; each of "
@@ -83,9 +80,7 @@ def _row(row: Array, where: str, axes: Array) -> dict[str, Any]:
     pose, (near, far) = row[:15].reshape(3, 5), row[15:]
     height, width, focal = pose[:, 4].tolist()
     if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE and focal > 0):
-        raise InputError(
-            f"{where}: height, width and focal length must be positive pixels, got {height:g}, {width:g} and {focal:g}."
-        )
+        raise InputError(f"{where}: height, width, focal length must be above 0, got {height:g}, {width:g}, {focal:g}.")
     if not 0 < near < far:
         raise InputError(f"{where}: the depth bounds must be 0 < near < far, got {near:g} and {far:g}.")
     check_rotation(pose[:, :3], f"{where}: the pose")
@@ -213,8 +208,7 @@ def _depth_cloud(folder: Path, frames: list[Frame]) -> Cloud:
     maps = [image.path for image in _of_folder(folder / DEPTH)]
     if len(maps) != len(frames):
         raise InputError(
-            f"{folder / DEPTH} holds {len(maps)} depth maps for {len(frames)} images; each image needs one, or remove "
-            "the folder."
+            f"{folder / DEPTH} holds {len(maps)} maps for {len(frames)} images; add the rest, or remove it."
         )
     chosen = evenly(list(zip(frames, maps, strict=True)), MAPS)
     random, points, colors = np.random.default_rng(0), [], []

@@ -99,9 +99,7 @@ def read_lens(frame: Fields, shared: Fields, image: ImageFile) -> tuple[Lens, bo
     else:
         angle = source("camera_angle_x")
         if "camera_angle_x" not in angle:
-            raise InputError(
-                f"{frame.where} and {shared.where} have neither fl_x nor camera_angle_x; give one of the two."
-            )
+            raise InputError(f"{frame.where} and {shared.where} have neither fl_x nor camera_angle_x; give one.")
         fov_x = angle.number("camera_angle_x")
         if not 1e-6 < fov_x < math.pi:
             raise InputError(f"{angle.where}: camera_angle_x must be radians between 0 and pi, got {fov_x:g}.")
@@ -132,9 +130,7 @@ def _read_nerfstudio(folder: Path, image_size: int | None) -> Capture:
     names = [frame.name.file for frame in frames]
     if len(set(names)) < len(names):
         twice = next(name for i, name in enumerate(names) if name in names[:i])
-        raise InputError(
-            f"{path}: {len(names)} frames name {len(set(names))} images; {twice} is there twice: keep one frame of it."
-        )
+        raise InputError(f"{path}: {len(names)} frames name {len(set(names))} images; keep one frame of {twice}.")
     if splits := _splits(data, names, files):
         unlisted = [name for name in names if name not in splits]
         frames = [dataclasses.replace(frame, split=splits.get(frame.name.file)) for frame in frames]
@@ -183,9 +179,7 @@ def _listed(data: Fields, field: str, names: list[str], files: CaptureFiles) -> 
         if (file := files.find(name)) in known:
             found.append(str(file))
         elif PurePosixPath(name.replace("\\", "/")) not in stated:
-            raise InputError(
-                f"{data.where}: {field} names {name[:80]}, which is none of its {len(names)} frames; remove it there."
-            )
+            raise InputError(f"{data.where}: {field} names {name[:80]}, none of its {len(names)} frames; remove it.")
     return found
 
 

@@ -52,9 +52,7 @@ class OwnField(nn.Module):
             if values is not None and not isinstance(values, Tensor):
                 raise InputError(f"the field {name} must return a Tensor as {part}, got {type(values).__name__}.")
             if values is not None and tuple(values.shape) != (len(means), *row):
-                raise InputError(
-                    f"the field {name} must return {part} of shape {(len(means), *row)}, got {tuple(values.shape)}."
-                )
+                raise InputError(f"the field {name} returned {part} {tuple(values.shape)}, not {(len(means), *row)}.")
         return move
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
