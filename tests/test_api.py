@@ -349,7 +349,7 @@ def test_a_scene_to_start_from_keeps_its_field(dataset: Dataset, device: Device)
     ("parts", "message"),
     [
         ({"losses": [len]}, "losses=...) must list Regularizer and TorchLoss, got a builtin"),
-        ({"rates": {"mlp": (1e-2, 1e-3)}}, "gives mlp the rate (0.01, 0.001); give 0 or more, or Rate("),
+        ({"rates": {"mlp": (1e-2, 1e-3)}}, "gives mlp (0.01, 0.001); give 0 or more, or Rate("),
     ],
 )
 def test_parts_of_another_kind_are_refused(parts: dict[str, Any], message: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -59,7 +60,12 @@ def test_pruning_keeps_the_largest_whatever_they_contribute(device: Device, monk
     monkeypatch.setattr(density_control, "LEAST_KEPT", 3)
     optimizer = Optimizer(scene.parameters, {}, config.rates.schedules())
     control = density_control.DensityControl(
-        config, scene, optimizer, published_rule, shown, lambda view: view.camera, 1.0, torch.Generator()
+        config,
+        scene,
+        SimpleNamespace(optimizer=optimizer, camera=lambda view: view.camera),
+        published_rule,
+        SimpleNamespace(train=shown, extent=1.0),
+        torch.Generator(),
     )
     kept = scene.parameters["means"].detach()[most >= most.sort().values[-3]]
     control.change(4, moving=True)

@@ -30,8 +30,8 @@ from lapgs_wgpu.splat.drawing import Drawing
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.train.config import Config
+from lapgs_wgpu.train.resident_passes import Task
 from lapgs_wgpu.train.resident_step import Flying
-from lapgs_wgpu.train.resident_task import Task
 from lapgs_wgpu.train.run_folder import load_state
 from lapgs_wgpu.train.step_result import Scheduled, StepResult
 from lapgs_wgpu.train.trainer import Trainer

@@ -1,4 +1,4 @@
-"""Matrix products on the device."""
+"""Matrix products on the device, and sums of columns."""
 
 from __future__ import annotations
 
@@ -88,3 +88,19 @@ class Matmul:
             b=b.array,
             c=c.array,
         )
+
+
+def sum_columns(
+    commands: Commands,
+    pool: BufferPool,
+    values: DeviceArray,
+    totals: DeviceArray,
+    *,
+    columns: int = 1,
+    place: int = 0,
+    factor: float = 1.0,
+) -> None:
+    """Record the sums of the columns of values, times a factor, into `totals` from `place` on."""
+    kernel = Kernel.get(commands.device, "sum_values")
+    content = kernel.uniform("Values", rows=values.size // columns, columns=columns, place=place, factor=factor)
+    commands.dispatch(kernel, columns, sum=pool.constant(content), values=values, totals=totals)

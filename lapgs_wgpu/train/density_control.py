@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from lapgs_wgpu.data.views import View, spread_views
+from lapgs_wgpu.data.views import Dataset, View, spread_views
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.morton import morton_order
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.train.config import Config
@@ -24,7 +23,7 @@ from lapgs_wgpu.train.densify import (
     largest,
     reset_opacities,
 )
-from lapgs_wgpu.train.optimizer import Optimizer
+from lapgs_wgpu.train.learners import Learners
 
 MOST_VIEWS = 50  # by which Gaussians are pruned
 
@@ -39,18 +38,15 @@ class DensityControl:
         self,
         config: Config,
         scene: Scene4D,
-        optimizer: Optimizer,
+        learners: Learners,
         rule: DensityRule,
-        views: Sequence[View],
-        camera_of: Callable[[View], Camera],
-        extent: float,
+        dataset: Dataset,
         generator: torch.Generator,
     ) -> None:
-        """views: of the training. camera_of: a view's camera as it is drawn."""
         self._config, self._last = config.density, config.schedule.steps
-        self._scene, self._optimizer, self._rule = scene, optimizer, rule
-        self._views, self._camera_of = spread_views(views, MOST_VIEWS), camera_of
-        self._extent, self._generator = extent, generator
+        self._scene, self._learners, self._optimizer, self._rule = scene, learners, learners.optimizer, rule
+        self._views, self._extent = spread_views(dataset.train, MOST_VIEWS), dataset.extent
+        self._generator = generator
         self.statistics = Statistics.zeros(len(scene))
 
     def change(self, step: int, *, moving: bool) -> None:
@@ -79,7 +75,7 @@ class DensityControl:
         self.statistics = Statistics.zeros(len(scene))
 
     def _prune_hidden(self, moving: bool) -> None:
-        views = [dataclasses.replace(view, camera=self._camera_of(view)) for view in self._views]
+        views = [dataclasses.replace(view, camera=self._learners.camera(view)) for view in self._views]
         most = contributions(self._scene, views, moving=moving)
         keep = (most >= self._config.min_contribution) | largest(most, LEAST_KEPT)
         if not keep.all():

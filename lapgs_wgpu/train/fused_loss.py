@@ -43,17 +43,6 @@ class RenderLoss(NamedTuple):
         return psnr_of(self.terms["mse"])
 
 
-class _Comparison(NamedTuple):
-    camera: Camera
-    camera_unit: float
-    antialiased: bool
-    truth: DeviceArray
-    background: tuple[float, float, float]
-    weights: LossWeights
-    device: Device
-    own: Sequence[tuple[TorchLoss, float]]
-
-
 # The passes of a device, whose buffers serve all calls of `render_loss`.
 image_loss_of, exposure_of = functools.cache(ImageLoss), functools.cache(ExposurePasses)
 
@@ -80,13 +69,10 @@ def render_loss(
     the gradient by a small change of the camera: rotation, shift in units of `camera_unit`, world units
     (splat.drawing.CameraGradient).
     """
-    of_gaussians = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh
     probe = gaussians.means.new_empty((len(gaussians), 2)).requires_grad_()
-    red, green, blue = background.tolist()
-    comparison = _Comparison(
-        camera, camera_unit, gaussians.antialiased, truth, (red, green, blue), weights, device, own
-    )
-    loss, computed, radii, centres = _FusedLoss.apply(comparison, *of_gaussians, correction, camera_change, probe)
+    differentiable = *gaussians.arrays().values(), correction, camera_change, probe
+    given = gaussians.antialiased, camera, camera_unit, truth, tuple(background.tolist()), weights, device, own
+    loss, computed, radii, centres = _FusedLoss.apply(*differentiable, given)
     probe.data = centres
     names = ("l1", "mse", "ssim", "pyramid", "ncc", *(term.name for term, _ in own))
     used = (True, True, weights.ssim, weights.pyramid, weights.ncc, *[True] * len(own))
@@ -97,27 +83,17 @@ def render_loss(
 class _FusedLoss(torch.autograd.Function):
     """The loss, whose gradients are computed together with it.
 
-    forward submits all passes at once, and one read-back brings what the host needs; backward multiplies the gradients
-    that are then already there.
+    apply(means, quats, scales, opacities, sh, correction, change, probe, given): probe (N, 2) takes the gradient by the
+    projected means; given is what else `render_loss` was given. forward submits all passes at once, and one read-back
+    brings what the host needs; backward multiplies the gradients that are then already there.
     """
 
     @staticmethod
-    def forward(
-        ctx: Any,
-        comparison: _Comparison,
-        means: Tensor,
-        quats: Tensor,
-        scales: Tensor,
-        opacities: Tensor,
-        sh: Tensor,
-        correction: Tensor | None,
-        change: Tensor | None,
-        probe: Tensor,
-    ) -> tuple[Tensor, ...]:
-        camera, unit, antialiased, truth, background, weights, device, own = comparison
+    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
+        *leaves, correction, change, probe, given = arguments
+        antialiased, camera, unit, truth, background, weights, device, own = given
         rasterizer, losses, exposing = rasterizer_of(device), image_loss_of(device), exposure_of(device)
-        leaves = Gaussians(means, quats, scales, opacities, sh=sh, antialiased=antialiased)
-        gaussians = upload_gaussians(rasterizer.pool, leaves)
+        gaussians = upload_gaussians(rasterizer.pool, Gaussians(*leaves, antialiased=antialiased))
         corrections = None if correction is None else upload(exposing.pool, "correction", correction)
         while True:
             drawing = rasterizer.draw(gaussians, camera, background, gradient=True)
@@ -139,7 +115,7 @@ class _FusedLoss(torch.autograd.Function):
             # Where the intersections did not fit, none of this is right, and all of it is done again.
             if not rasterizer.grow_on_overflow(drawing, list(found)):
                 break
-        by_gaussians, d_means2d = gradient_tensors(gradients, opacities)
+        by_gaussians, d_means2d = gradient_tensors(gradients, leaves[3])
         by_correction = None if correction is None else correction.new_tensor(rows[0].sum(axis=0, dtype=np.float64))
         by_camera = None
         if change is not None:
@@ -155,7 +131,7 @@ class _FusedLoss(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *d_outputs: Any) -> tuple[Tensor | None, ...]:
         scaled = (None if gradient is None else d_outputs[0] * gradient for gradient in ctx.gradients)
-        return (None, *scaled)
+        return (*scaled, None)
 
 
 def _own_terms(

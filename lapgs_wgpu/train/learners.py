@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Mapping
 from torch import Tensor
 
 from lapgs_wgpu.data.views import Dataset, View
-from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.camera_refinement import CameraRefinement, RefinedCamera, ScenePoints, scene_points
 from lapgs_wgpu.train.config import Config
@@ -44,9 +43,11 @@ class Learners:
             count = len(dataset.cameras) if dataset.is_rig else len(dataset.train)
             self._exposures = Exposures(count, config.exposure.rate)
         if config.cameras.refines(own_footage=dataset.own_footage):
-            self._cameras = CameraRefinement(
-                dataset.cameras, dataset.extent, config.cameras, lambda: _points_of(scene), start.corrections
-            )
+
+            def points() -> ScenePoints:
+                return scene_points(scene.parameters["means"], scene.parameters["opacity_logits"].sigmoid())
+
+            self._cameras = CameraRefinement(dataset.cameras, dataset.extent, config.cameras, points, start.corrections)
         self.on_access: Callable[[], None] = lambda: None
         of_camera = {camera: number for number, camera in enumerate(dataset.cameras)}
         self.image_numbers = {
@@ -133,8 +134,3 @@ class Learners:
         for each in (self.frequencies, self.exposures, self.cameras):
             if each is not None:
                 yield each
-
-
-def _points_of(scene: Scene4D) -> ScenePoints:
-    """What moves in the images when a camera moves: the canonical Gaussians."""
-    return scene_points(scene.parameters["means"], scene.parameters["opacity_logits"].sigmoid())

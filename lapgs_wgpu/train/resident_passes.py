@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+from lapgs_wgpu.data.views import View
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
+from lapgs_wgpu.gpu.matmul import sum_columns
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.gpu.recording import Recording
-from lapgs_wgpu.gpu.sums import sum_columns
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.passes.activation_passes import ActivationPasses, Line
 from lapgs_wgpu.motion.passes.grid_field_passes import Comparison, Decoding, GridFieldPasses
+from lapgs_wgpu.motion.passes.samples import Samples
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.drawing import Drawing, GaussianGradients
 from lapgs_wgpu.splat.gaussians import Gaussians
@@ -22,10 +25,38 @@ from lapgs_wgpu.train.fused_loss import image_loss_of
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.resident_corrections import ResidentCorrections
 from lapgs_wgpu.train.resident_parameters import ResidentParameters, check_finite
-from lapgs_wgpu.train.resident_task import Task
+from lapgs_wgpu.train.step_result import Scheduled
+from lapgs_wgpu.train.view_order import Mark
 
 TOTALS = ("static", "temporal", "acceleration", "dynamics")  # sums of losses of motion, in their places
 _DYNAMICS_GROUPS, _MOST_COLUMNS = 64, 256  # common/dynamics.wgsl
+
+
+@dataclass
+class Task:
+    """A resident step to be taken.
+
+    scheduled: what the schedule says. before, drawn: where the draws stood before its view and before its samples.
+    view: of the training, on a background (3,). time: of the field. sh_degree: of the harmonics in use. rates: of the
+    optimizer's groups, and of the frequencies. near, near_time: the places and the time that the smoothness loss
+    compares; None in steps without it. even, even_times: those of the acceleration loss. counts: how many steps had
+    moved each tensor before.
+    """
+
+    scheduled: Scheduled
+    before: Mark
+    drawn: Mark
+    view: View
+    background: tuple[float, float, float]
+    time: float
+    sh_degree: int
+    rates: dict[str, float]
+    frequency_rate: float
+    near: Samples | None = None
+    near_time: float = 0.0
+    even: Samples | None = None
+    even_times: tuple[float, float] = (0.0, 0.0)
+    counts: dict[str, int] = field(default_factory=dict)
 
 
 class Recorded(NamedTuple):

@@ -33,8 +33,7 @@ from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.motion_losses import compared_counts, even_times, near_time
 from lapgs_wgpu.train.nonfinite import Skipped, cause, check_parameters
 from lapgs_wgpu.train.resident_parameters import PARTS
-from lapgs_wgpu.train.resident_passes import ResidentPasses
-from lapgs_wgpu.train.resident_task import Task
+from lapgs_wgpu.train.resident_passes import ResidentPasses, Task
 from lapgs_wgpu.train.step_result import Measured, Scheduled
 from lapgs_wgpu.train.view_order import Draws
 

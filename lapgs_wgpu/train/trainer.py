@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -102,31 +103,17 @@ class Trainer:
         self.whole = True
 
     def _prepare(self, start: Start) -> None:
-        config, scene, dataset, extent = self.config, self.scene, self.dataset, self.dataset.extent
+        config, scene, dataset = self.config, self.scene, self.dataset
         self._color = torch.full((3,), BACKGROUND_LEVELS[config.data.background])  # of measurements
         color = None if config.data.background == "random" else self._color
         self._truth = GroundTruth(scene.device, color, int(config.data.cache_gb * 1e9))
         self._draws = Draws(dataset.train, self._generator, color)
         self._learners = Learners(config, dataset, self.parts, start)
-        self._density = DensityControl(
-            config,
-            scene,
-            self._learners.optimizer,
-            self.parts.density,
-            dataset.train,
-            self._learners.camera,
-            extent,
-            self._generator,
-        )
+        self._density = DensityControl(config, scene, self._learners, self.parts.density, dataset, self._generator)
         self.timing = None
         if config.timing.refine and scene.field is not None and len(dataset.times) > 2:
-            self.timing = TimingRefinement(
-                scene,
-                dataset.train,
-                lambda view: self._truth.on_host(view, self._color),
-                self._picture,
-                dataset.time_gap,
-            )
+            truth = partial(self._truth.on_host, color=self._color)
+            self.timing = TimingRefinement(scene, dataset.train, truth, self._picture, dataset.time_gap)
         self._timing_steps = config.timing.corrections(config.schedule.steps) if self.timing else []
         self._skipped = 0  # steps in a row
         shared = self._learners, self._density, self._truth, self._draws
