@@ -40,7 +40,7 @@ def row(name: str, amount: float, seed: int, *, refine: bool) -> str:
         for _ in training:
             pass
         given, refinement = data.cameras, training.cameras
-        found = given if refinement is None else [refinement.refined(camera).camera for camera in given]
+        found = given if refinement is None else [refinement.refined(camera) for camera in given]
         turn, shift = (float(np.median(errors)) for errors in pose_errors(found, true))
         psnr, aligned = training.psnr(data.test), ""
         if refine:

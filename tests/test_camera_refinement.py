@@ -83,7 +83,7 @@ def test_the_change_of_a_camera_is_that_of_the_gradient() -> None:
     gradient[1] = torch.tensor([0.3, -0.1, -0.3, 20.0, -5.0, 1.0])
     refinement.values.grad = gradient
     refinement.step(1)
-    moved = refinement.refined(given[1]).camera
+    moved = refinement.refined(given[1])
     turn = Rotation.from_matrix(moved.T_cam_world[:3, :3].T @ given[1].T_cam_world[:3, :3]).as_rotvec()
     change = np.concatenate([turn, (moved.position - given[1].position) / 2.0])
     motion = image_motion(given[1], POINTS, 2.0)
@@ -92,7 +92,7 @@ def test_the_change_of_a_camera_is_that_of_the_gradient() -> None:
     np.testing.assert_allclose(change / np.linalg.norm(change), expected / np.linalg.norm(expected), atol=1e-7)
     assert change @ damped @ change == pytest.approx(CONFIG.rate.start**2, rel=1e-6)
     for number in (0, 2, 3, 4):
-        np.testing.assert_allclose(refinement.camera(number).T_cam_world, given[number].T_cam_world, atol=1e-14)
+        np.testing.assert_allclose(refinement.refined(given[number]).T_cam_world, given[number].T_cam_world, atol=1e-14)
     assert refinement.values.grad is None
     assert not refinement.values.any()
     report = refinement.report()
@@ -185,7 +185,7 @@ def refined_walk(device: Device) -> tuple[Trainer, list[Camera]]:
 def test_disturbed_poses_are_found_again(refined_walk: tuple[Trainer, list[Camera]]) -> None:
     training, true = refined_walk
     given = training.dataset.cameras
-    before, after = pose_errors(given, true), pose_errors([training.cameras.refined(c).camera for c in given], true)
+    before, after = pose_errors(given, true), pose_errors([training.cameras.refined(c) for c in given], true)
     assert np.median(before[0]) == pytest.approx(1, abs=0.1)
     assert np.median(after[0]) < 0.2 * np.median(before[0])
     assert np.median(after[1]) < 0.5 * np.median(before[1])  # 0.41 here, 0.2 after 1,500 steps (docs/data.md)
@@ -219,11 +219,11 @@ def test_what_discovery_corrected_stays_corrected(device: Device, dataset: Datas
     config = configure(cameras__refine="on", discovery__enabled="true", discovery__steps="20", discovery__size="32")
     with start_training(config, dataset, device) as training:
         assert training.cameras is not None
-        start = [training.cameras.refined(camera).camera for camera in dataset.cameras]
+        start = [training.cameras.refined(camera) for camera in dataset.cameras]
         moved = [np.abs(a.T_cam_world - b.T_cam_world).max() for a, b in zip(start, dataset.cameras, strict=True)]
         assert np.count_nonzero(np.array(moved) > 1e-5) == len(dataset.cameras)
         training.step()  # at once, though cameras.start is later
-        later = [training.cameras.refined(camera).camera for camera in dataset.cameras]
+        later = [training.cameras.refined(camera) for camera in dataset.cameras]
         assert any(np.abs(a.T_cam_world - b.T_cam_world).max() > 1e-7 for a, b in zip(start, later, strict=True))
 
 

@@ -127,6 +127,8 @@ def _screenshot(given: Any, scene: LoadedScene) -> None:
 
 
 def _video(given: Any, scene: LoadedScene) -> None:
+    import numpy as np
+
     from lapgs_wgpu.viewer import video
     from lapgs_wgpu.viewer.camera import ViewCamera
     from lapgs_wgpu.viewer.capture_views import find_view
@@ -148,7 +150,7 @@ def _video(given: Any, scene: LoadedScene) -> None:
 
     if path == "time":
         camera = framed(view.camera, *size) if view else scene.camera().camera(*size)
-        cameras = video.clip_views(camera, frames)
+        cameras = ((camera, share) for share in np.linspace(0, 1, frames).tolist())
     else:
         start, arc, time = scene.camera(), scene.initial_view.arc, 0.0
         if view is not None:

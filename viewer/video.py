@@ -29,11 +29,6 @@ def count_frames(seconds: float, fps: float) -> int:
     return frames
 
 
-def clip_views(camera: Camera, frames: int) -> Iterator[TimedCamera]:
-    """Keep the camera still while the clip plays once."""
-    return ((camera, share) for share in np.linspace(0, 1, frames).tolist())
-
-
 def orbit_views(
     start: ViewCamera,
     size: tuple[int, int],

@@ -7,7 +7,6 @@ import time
 from collections import deque
 from typing import Any
 
-from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.viewer.frame import Frame, FrameRequest
 from lapgs_wgpu.viewer.present import Presenter
 from lapgs_wgpu.viewer.view_state import ViewState
@@ -62,7 +61,7 @@ class Viewport:
         state, (width, height) = self.state, self.canvas.get_physical_size()
         full = state.camera.camera(max(1, width), max(1, height))
         shown = state.clock.time, state.mode, state.background, state.antialiased
-        key = (*_camera_key(full), *shown)
+        key = full.K.tobytes(), full.T_cam_world.tobytes(), full.width, full.height, *shown
         moving = bool(self._drawn) and key != self._drawn  # not the first frame
         if key != self._drawn:
             self.moved_at = now
@@ -101,7 +100,3 @@ class Viewport:
             K, T = camera.K, camera.T_cam_world
             ray = [(column + 0.5 - K[0, 2]) / K[0, 0], (row + 0.5 - K[1, 2]) / K[1, 1], 1.0]
             self.state.camera.focus_on(camera.position + depth * (T[:3, :3].T @ ray))
-
-
-def _camera_key(camera: Camera) -> tuple[bytes, bytes, int, int]:
-    return camera.K.tobytes(), camera.T_cam_world.tobytes(), camera.width, camera.height

@@ -108,7 +108,7 @@ def page_html(scene: bytes, title: str, poster: NDArray[np.uint8], *, narrowest:
     narrowest: of the scene's first camera (`InitialView`)."""
     edge = "#" + bytes(np.median(poster[0], axis=0).astype(np.uint8)).hex()
     style = web_file("player.css").replace("{{background}}", edge).replace("{{narrowest}}", f"{narrowest:.4g}")
-    script = _script()
+    script = "\n".join(module_script(name) for name in MODULES)  # pages from file:// cannot import others
     policy = "; ".join([
         "default-src 'none'",
         f"script-src '{_digest(script)}'",
@@ -145,11 +145,6 @@ def page_keys() -> list[KeyBinding]:
 
 def _options(texts: Iterable[str]) -> str:
     return "".join(f"<option>{html.escape(text)}</option>" for text in texts)
-
-
-def _script() -> str:
-    """Join the modules, because pages from file:// cannot import others."""
-    return "\n".join(module_script(name) for name in MODULES)
 
 
 def module_script(name: str) -> str:

@@ -66,7 +66,12 @@ def check_plausible(frames: Sequence[Frame]) -> list[str]:
     """Warn about principal points far from the image's middle, and about images that are nearly black or transparent:
     those of 16 bits that use fewer, and those with alpha."""
     warnings = []
-    off = {frame.lens: frame.where for frame in reversed(frames) if _off_center(frame.lens)}
+    lenses = {frame.lens: frame.where for frame in reversed(frames)}
+    off = {
+        lens: where
+        for lens, where in lenses.items()
+        if max(abs(lens.cx / lens.width - 0.5), abs(lens.cy / lens.height - 0.5)) > OFF_CENTER
+    }
     if off:
         lens, where = next(reversed(off.items()))
         warnings.append(
@@ -108,10 +113,6 @@ def _low_levels(images: Sequence[ImageFile], channels: slice, what: str, of: str
         return None
     told = f"{what}: in {len(looked_at)} of {len(images)}, such as {looked_at[0]}, no {of} is above {highest} of 255"
     return told, highest
-
-
-def _off_center(lens: Lens) -> bool:
-    return max(abs(lens.cx / lens.width - 0.5), abs(lens.cy / lens.height - 0.5)) > OFF_CENTER
 
 
 def _fits(size: Size, lens: Lens) -> bool:

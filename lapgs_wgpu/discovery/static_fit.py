@@ -52,7 +52,7 @@ def static_fit(config: Config, dataset: Dataset, device: Device, progress: Calla
     images, depths = [], []
     for view in small:
         image = (composite(view.load(), background.numpy()) / 255).astype(np.float32)
-        camera = view.camera if refinement is None else refinement.refined(view.camera).camera
+        camera = view.camera if refinement is None else refinement.refined(view.camera)
         rendering = training.scene.render(camera, view.time, background, depth=view.moving is not None)
         still = rendering.image.numpy(force=True)
         if (correction := training.exposure_of(view)) is not None:

@@ -37,15 +37,11 @@ class BindGroup:
     store: dict[Any, BindGroup]
     key: Any
 
-    def drop(self) -> None:
-        """Remove it from the cache, since one of its buffers was freed."""
-        self.store.pop(self.key, None)
-
 
 def _forget(bound: weakref.WeakSet[BindGroup], device: Device, nbytes: int) -> None:
     device.allocated_bytes -= nbytes
     for group in list(bound):
-        group.drop()
+        group.store.pop(group.key, None)
 
 
 def _height(rows: int) -> int:

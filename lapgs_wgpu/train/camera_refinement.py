@@ -106,15 +106,6 @@ class CameraDescent:
         return {"mean": self._mean, "square": self._square, "steps": self._steps, "moves": self._moves}
 
 
-class RefinedCamera(NamedTuple):
-    """A corrected camera; and `change` (6,), zeros whose gradient is that by a further change of it: a rotation about
-    its center along the world's axes, radians; a shift in units of the cameras' extent. None where the camera is
-    kept."""
-
-    camera: Camera
-    change: Tensor | None
-
-
 class Pace(NamedTuple):
     """How far a step moves a camera: rate, radians of the image's motion; damping, of `whitening`; kept, the share of
     the correction that is not pulled back."""
@@ -152,7 +143,8 @@ class CameraRefinement:
         self._cameras, self.extent, self._config, self._points = list(cameras), extent, config, points
         self.numbers = {camera: number for number, camera in enumerate(self._cameras)}
         count = len(self._cameras)
-        self.values = nn.Parameter(torch.zeros(count, 6))  # zeros that get the gradient
+        # Zeros that get the gradient by a further change of a camera: rotation, and shift in units of the extent.
+        self.values = nn.Parameter(torch.zeros(count, 6))
         self._learnt = torch.zeros(count, 6, dtype=torch.float64)  # rotation vectors, shifts
         self._descent = CameraDescent(count)
         self.common = torch.from_numpy(_common_motions(self._cameras, extent))
@@ -162,14 +154,9 @@ class CameraRefinement:
             for number, correction in before.items():
                 self._learnt[number] = torch.from_numpy(correction * _units(1 / extent))
 
-    def refined(self, camera: Camera) -> RefinedCamera:
+    def refined(self, camera: Camera) -> Camera:
         """The corrected form of one of the cameras (the same object)."""
-        number = self.numbers[camera]
-        return RefinedCamera(self.camera(number), self.values[number])
-
-    def camera(self, number: int) -> Camera:
-        """The corrected form of a camera, by its number."""
-        return changed_camera(self._cameras[number], self._learnt[number].numpy() * _units(self.extent))
+        return changed_camera(camera, self._learnt[self.numbers[camera]].numpy() * _units(self.extent))
 
     def corrections_of(self, cameras: Mapping[int, Camera]) -> Corrections:
         """What the cameras (the same objects) are corrected by, under the given numbers."""
@@ -195,7 +182,7 @@ class CameraRefinement:
         rate, damping, kept = pace
         rows, points = gradient.any(dim=1).nonzero()[:, 0].tolist(), self._points()
         for row in rows:
-            whiten = whitening(image_motion(self.camera(row), points, self.extent), damping)
+            whiten = whitening(image_motion(self.refined(self._cameras[row]), points, self.extent), damping)
             change = self._descent.change(row, gradient[row].double().numpy(), whiten, rate)
             turned = Rotation.from_rotvec(change[:3]) * Rotation.from_rotvec(self._learnt[row, :3].numpy())
             self._learnt[row, :3] = torch.from_numpy(turned.as_rotvec())

@@ -64,7 +64,7 @@ def evaluate(
     color = torch.full((3,), BACKGROUND_LEVELS[background])
     rows = []
     for view in views:
-        truth, image = _on(color, view), _render(scene, view, color)
+        truth, image = composite(view.load(), color.numpy()), _render(scene, view, color)
         row: dict[str, Any] = {"view": view.name, "time": view.time}
         row |= _measures(_unit(image), _unit(truth), lpips)
         row |= _parts(_unit(image), _unit(truth), None if view.moving is None else view.moving())
@@ -87,10 +87,6 @@ def evaluate(
         "seconds": round(time.perf_counter() - start, 3),
         "environment": environment(scene.device),
     }
-
-
-def _on(color: Tensor, view: View) -> NDArray[np.uint8]:
-    return composite(view.load(), color.numpy())
 
 
 def _render(scene: Scene4D, view: View, color: Tensor) -> NDArray[np.uint8]:

@@ -91,21 +91,21 @@ class ExchangeStep:
     ) -> tuple[Measured, RenderLoss]:
         """Add the gradients of a view's loss to those of all that learns."""
         config, scene, moving = self._config, self._scene, scheduled.moving
-        camera, correction = self._learners.refined_camera(view), self._learners.exposure(view)
+        learners = self._learners
         now = scene.deformed(view.time, nearby, time_samples) if moving else Deformed(scene.canonical(), None, [])
         weights = config.loss.weights(warm=moving)
         weighted = [(term, weight) for term in self._own_terms if (weight := weight_at(term, scheduled.step))]
         of_image = [(term, weight) for term, weight in weighted if not isinstance(term, Regularizer)]
         rendering = render_loss(
             now.gaussians,
-            camera.camera,
+            learners.camera(view),
             self._truth.on_device(view),
             background,
             weights,
             scene.device,
-            correction,
+            learners.exposure(view),
             of_image,
-            camera.change,
+            learners.camera_change(view),
             self._extent,
         )
         of_motion: dict[str, Tensor] = {}

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.train.camera_refinement import CameraRefinement, RefinedCamera, ScenePoints, scene_points
+from lapgs_wgpu.train.camera_refinement import CameraRefinement, ScenePoints, scene_points
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.exposure import Exposures
 from lapgs_wgpu.train.nonfinite import Tensors
@@ -76,14 +76,14 @@ class Learners:
         self._field_fitted = fitted
         self.optimizer.highest = max_field_rates(self._groups) if fitted else {}
 
-    def refined_camera(self, view: View) -> RefinedCamera:
-        """The camera of a training view, corrected where it is, and what gets the gradient by it."""
-        cameras = self.cameras
-        return RefinedCamera(view.camera, None) if cameras is None else cameras.refined(view.camera)
-
     def camera(self, view: View) -> Camera:
         """The camera of a training view, corrected where it is."""
-        return self.refined_camera(view).camera
+        return view.camera if (cameras := self.cameras) is None else cameras.refined(view.camera)
+
+    def camera_change(self, view: View) -> Tensor | None:
+        """(6,) zeros that get the gradient by a change of a training view's camera; None where it is kept."""
+        cameras = self._cameras
+        return None if cameras is None else cameras.values[cameras.numbers[view.camera]]
 
     def exposure(self, view: View) -> Tensor | None:
         """The correction (3, 4) of the colors of a training view; None where they are taken as they are."""

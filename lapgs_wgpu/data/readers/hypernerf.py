@@ -120,16 +120,11 @@ def _read_camera(data: Fields) -> tuple[Lens, np.ndarray]:
     return lens, world_to_camera(R_cam_world.T, data.vector("position", 3))
 
 
-def _factor_folders(folder: Path) -> list[Path]:
-    """Return the folders 1x, 2x, ... in a folder, by number: the same images at 1 / N of their size."""
-    children = [child for child in folder.glob("*x") if re.fullmatch(r"[1-9]\d{0,3}x", child.name)]
-    return sorted(children, key=lambda child: int(child.name[:-1]))
-
-
 def _image_folder(rgb: Path, names: Sequence[str], image_size: int | None) -> Path:
-    """Return the folder rgb/Nx that suits the wanted size best."""
+    """Return the folder rgb/Nx, of images at 1 / N of their size, that suits the wanted size best."""
     best: Path | None = None
-    for folder in _factor_folders(rgb):  # from the largest images on
+    folders = [child for child in rgb.glob("*x") if re.fullmatch(r"[1-9]\d{0,3}x", child.name)]
+    for folder in sorted(folders, key=lambda child: int(child.name[:-1])):
         first = next((file for name in names if (file := folder / f"{name}.png").is_file()), None)
         if first is not None:
             longer = max(check_image(first, whole=False).size)
