@@ -40,7 +40,7 @@ def test_exposure(device: Device, size: tuple[int, int]) -> None:
     rows = DeviceArray.upload(device, "rows", np.concatenate([np.zeros((2, 4), np.float32), CORRECTION.numpy()]))
     with Commands(device) as commands:
         exposed = passes.record(commands, drawn, rows, lambda: 2)
-        back = passes.record_bwd(commands, drawn, d, rows, lambda: 2)
+        d_image, d_rows = passes.record_bwd(commands, drawn, d, rows, lambda: 2)
 
     def tensor(planes: NDArray[np.float32]) -> torch.Tensor:
         return torch.from_numpy(planes[:3]).permute(1, 2, 0).double()
@@ -52,10 +52,10 @@ def test_exposure(device: Device, size: tuple[int, int]) -> None:
     assert leaves[1].grad is not None
     found = tensor(exposed.read())
     torch.testing.assert_close(found, expected.detach(), rtol=0, atol=1e-6)
-    d_image = back.d_image.read()
+    d_image = d_image.read()
     assert relative(tensor(d_image), leaves[0].grad) < 1e-6
     assert (d_image[3] == 0).all()
-    d_rows = back.d_rows.read().astype(np.float64)
+    d_rows = d_rows.read().astype(np.float64)
     assert relative(torch.from_numpy(d_rows.sum(axis=0)), leaves[1].grad) < 1e-5
 
 

@@ -65,10 +65,10 @@ def record(
     image = DeviceArray.upload(losses.device, "image", planes)
     truth = upload_rgba(losses.device, pair.truth)
     with Commands(losses.device) as commands:
-        done = losses.record(commands, image, truth, background, weights)
-    planes = done.d_image.read()
+        terms, d_image = losses.record(commands, image, truth, background, weights)
+    planes = d_image.read()
     assert (planes[3] == 0).all()
-    return done.terms.read(), planes[:3].transpose(1, 2, 0)
+    return terms.read(), planes[:3].transpose(1, 2, 0)
 
 
 def smooth_pair(height: int, width: int) -> Pair:

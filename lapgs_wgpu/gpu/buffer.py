@@ -18,7 +18,6 @@ from lapgs_wgpu.gpu.shader import TABLE_TYPES, TABLE_WIDTH
 from lapgs_wgpu.gpu.wgpu_errors import TranslatedErrors
 
 _STORAGE = wgpu.BufferUsage.STORAGE | wgpu.BufferUsage.UNIFORM | wgpu.BufferUsage.COPY_SRC | wgpu.BufferUsage.COPY_DST
-_SMALL = 1 << 16  # bytes that go through the queue where buffers are not mapped
 _MAPPABLE = wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.MAP_WRITE
 _MOST_ROWS = 8192  # of a texture, by WebGPU's default limits
 _numbers = itertools.count()
@@ -38,8 +37,7 @@ class BindGroup:
     key: Any
 
 
-def _forget(bound: weakref.WeakSet[BindGroup], device: Device, nbytes: int) -> None:
-    device.allocated_bytes -= nbytes
+def _forget(bound: weakref.WeakSet[BindGroup]) -> None:
     for group in list(bound):
         group.store.pop(group.key, None)
 
@@ -68,9 +66,8 @@ class _Texture:
 class Buffer:
     """A storage or uniform buffer of `nbytes` (rounded up to 16), initially zero.
 
-    On CPU devices the buffer is mapped itself, and the processor reads and writes it with one copy. Others use staging
-    buffers of the same size. The one for reading is kept; the one for writing is kept from the second write on, so that
-    write-once buffers do not take their memory twice.
+    On CPU devices the buffer is mapped itself, and the processor reads and writes it with one copy. Others are written
+    through the queue, and read through a staging buffer of the same size, which is kept.
     """
 
     def __init__(self, device: Device, nbytes: int, label: str) -> None:
@@ -84,12 +81,9 @@ class Buffer:
         self.number = next(_numbers)  # unique, also among freed buffers
         # Bind groups keep device memory alive: they are dropped with the buffer.
         self.bound: weakref.WeakSet[BindGroup] = weakref.WeakSet()
-        device.allocated_bytes += self.nbytes
-        weakref.finalize(self, _forget, self.bound, device, self.nbytes).atexit = False
+        weakref.finalize(self, _forget, self.bound).atexit = False
         self.version = 0  # number of writes: tells whether a texture made from the buffer is out of date
         self._textures: dict[str, _Texture] = {}
-        self._upload: Any = None
-        self._uploaded = False  # whether a write used staging before
         self._download: Any = None
 
     @property
@@ -112,26 +106,11 @@ class Buffer:
             return
         self.version += 1
         with TranslatedErrors(self.device, f"what is written to buffer {self.label!r}", data.nbytes):
-            if self.device.mappable:
-                self._fill(self.wgpu_buffer, data, offset)
-            elif data.nbytes <= _SMALL:
+            if not self.device.mappable:
                 self.device.queue.write_buffer(self.wgpu_buffer, offset, data)
-            else:
-                staging = self._upload
-                if staging is None:
-                    staging = self._create(wgpu.BufferUsage.MAP_WRITE | wgpu.BufferUsage.COPY_SRC)
-                self._fill(staging, data, offset)
-                encoder = self.device.wgpu_device.create_command_encoder()
-                size = (data.nbytes + 3) & ~3
-                encoder.copy_buffer_to_buffer(staging, offset, self.wgpu_buffer, offset, size)
-                self.device.queue.submit([encoder.finish()])
-                if self._uploaded:
-                    self._upload = staging
-                self._uploaded = True
-
-    def _fill(self, target: Any, data: NDArray[np.uint8], offset: int) -> None:
-        with Mapping(self.device, target, WRITE, offset, (data.nbytes + 7) & ~7) as content:
-            content[: data.nbytes] = data
+                return
+            with Mapping(self.device, self.wgpu_buffer, WRITE, offset, (data.nbytes + 7) & ~7) as content:
+                content[: data.nbytes] = data
 
     def texture(self, texel_format: str, offset: int, size: int) -> tuple[Any, TextureCopies | None]:
         """Return a view of a texture that holds `size` bytes from `offset` on, in rows of TABLE_WIDTH texels.

@@ -150,7 +150,6 @@ class Device:
     mappable: whether buffers can be mapped without a staging copy (CPU devices).
     recording: the Recording in which is taken down what is done now; None where it is not.
     generation: number of buffers that pools have made: what was recorded before the last one may use a freed one.
-    allocated_bytes: of all buffers at present, without staging buffers and textures.
     max_loop_turns: number of iterations, of all loops of an invocation together, after which the driver ends it; None
         for no limit.
     """
@@ -188,7 +187,6 @@ class Device:
         self.textures = self.is_cpu and limits.get("max-storage-textures-per-shader-stage", 0) >= 8
         self.max_loop_turns = SOFTWARE_LOOP_TURNS if self.is_cpu else None
         self.kernel_cache: dict[Any, Any] = {}
-        self.allocated_bytes = 0
         self.generation = 0
         self.recording: Any = None
 

@@ -94,9 +94,6 @@ def compose(name: str, defines: Defines) -> str:
     defines = enabled(defines)
     imported: set[str] = set()
 
-    def expand(file: str) -> list[str]:
-        return _expand_lines(shader_text(file).splitlines(), file)
-
     def _expand_lines(lines: list[str], file: str) -> list[str]:
         out: list[str] = []
         conditions: list[bool] = []
@@ -117,7 +114,7 @@ def compose(name: str, defines: Defines) -> str:
             elif word == "import":
                 if argument not in imported:
                     imported.add(argument)
-                    out += expand(argument)
+                    out += _expand_lines(shader_text(argument).splitlines(), argument)
             elif word == "table":
                 out.append(_table(argument, "TEXTURES" in defines, file))
             elif word == "unroll":
@@ -135,7 +132,7 @@ def compose(name: str, defines: Defines) -> str:
             raise ShaderError(f"shaders/{file}.wgsl: #ifdef without #endif")
         return out
 
-    return "\n".join(expand(name)) + "\n"
+    return "\n".join(_expand_lines(shader_text(name).splitlines(), name)) + "\n"
 
 
 def _table(argument: str, texture: bool, file: str) -> str:

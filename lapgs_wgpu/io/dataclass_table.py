@@ -81,14 +81,12 @@ def checked(kind: Any, value: Any, where: str, least: float = 0) -> Any:
             return value
         hint = did_you_mean(value, parts) if isinstance(value, str) else "."
         raise InputError(f"{where} must be {' or '.join(parts)}, got {shown(value)}{hint}")
-    if origin is tuple and parts[-1] is Ellipsis:
-        if not isinstance(value, list | tuple):
-            raise InputError(f"{where} must be a list, got {shown(value)}.")
-        return tuple(checked(parts[0], entry, f"{where}[{n}]", least) for n, entry in enumerate(value))
     if origin is tuple:
-        if not isinstance(value, list | tuple) or len(value) != len(parts):
-            raise InputError(f"{where} must be {len(parts)} numbers, got {shown(value)}.")
-        return tuple(checked(part, entry, where, least) for part, entry in zip(parts, value, strict=True))
+        many = parts[-1] is Ellipsis
+        if not isinstance(value, list | tuple) or (not many and len(value) != len(parts)):
+            raise InputError(f"{where} must be {'a list' if many else f'{len(parts)} numbers'}, got {shown(value)}.")
+        kinds = parts[:1] * len(value) if many else parts
+        return tuple(checked(part, entry, where, least) for part, entry in zip(kinds, value, strict=True))
     if origin is dict and isinstance(value, dict):
         return {key: checked(parts[1], entry, f"{where}.{key}", least) for key, entry in value.items()}
     if kind is Any:

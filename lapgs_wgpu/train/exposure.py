@@ -7,7 +7,6 @@ applied to the rendered image before the losses, and never to a view that is mea
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -28,14 +27,6 @@ EPS = 1e-15  # keeps 0 / 0 away
 def without_exposure(image: NDArray[np.float32], correction: NDArray[np.float32]) -> NDArray[np.float32]:
     """An image (H, W, 3) with its correction (3, 4) taken back: the colors that the scene has there."""
     return (image - correction[:, 3]) @ np.linalg.pinv(correction[:, :3]).T
-
-
-class Exposed(NamedTuple):
-    """An image (4, H, W) whose gradient was carried back: d_image, by the rendered image's planes; and d_rows
-    (H, 3, 4), whose sum is the gradient by the correction."""
-
-    d_image: DeviceArray
-    d_rows: DeviceArray
 
 
 class ExposurePasses:
@@ -65,12 +56,15 @@ class ExposurePasses:
         d_exposed: DeviceArray,
         corrections: DeviceArray,
         first: Callable[[], int] = lambda: 0,
-    ) -> Exposed:
-        """d_exposed: the gradient by the corrected image; its fourth plane counts as zeros."""
-        done = Exposed(self.pool.array("d_image", image.shape), self.pool.array("d_rows", (image.shape[1], 3, 4)))
-        arrays = {"image": image, "d_exposed": d_exposed, "corrections": corrections, **done._asdict()}
-        self._dispatch(commands, "exposure_bwd", first, **arrays)
-        return done
+    ) -> tuple[DeviceArray, DeviceArray]:
+        """The gradient by the rendered image's planes (4, H, W), and rows (H, 3, 4), whose sum is the correction's.
+
+        d_exposed: the gradient by the corrected image; its fourth plane counts as zeros.
+        """
+        d_image, d_rows = self.pool.array("d_image", image.shape), self.pool.array("d_rows", (image.shape[1], 3, 4))
+        arrays = {"image": image, "d_exposed": d_exposed, "corrections": corrections}
+        self._dispatch(commands, "exposure_bwd", first, **arrays, d_image=d_image, d_rows=d_rows)
+        return d_image, d_rows
 
     def _dispatch(
         self, commands: Commands, name: str, first: Callable[[], int], *, image: DeviceArray, **arrays: DeviceArray

@@ -40,15 +40,6 @@ def pyramid_weights(levels: int) -> list[float]:
     return [weight / sum(weights) for weight in weights]
 
 
-class LossArrays(NamedTuple):
-    """terms (5,) float32: L1, mean squared error, 1 - SSIM, pyramid, NCC; the last three 0 where their weight is 0.
-    d_image (4, H, W) float32: the weighted loss's gradient by red, green, blue, and zeros.
-    """
-
-    terms: DeviceArray
-    d_image: DeviceArray
-
-
 class ImageLoss:
     """Records the passes that compare images with their ground truth. Keeps its buffers from image to image.
 
@@ -69,8 +60,11 @@ class ImageLoss:
         truth: DeviceArray,
         background: tuple[float, float, float],
         weights: LossWeights,
-    ) -> LossArrays:
+    ) -> tuple[DeviceArray, DeviceArray]:
         """Compare an image with its ground truth.
+
+        Returns terms (5,) float32: L1, mean squared error, 1 - SSIM, pyramid, NCC; the last three 0 where their weight
+        is 0; and the weighted loss's gradient (4, H, W) float32 by red, green, blue, and zeros.
 
         image: planes (4, H, W) of float32, the first three red, green, blue. truth: (H, W) uint32, straight RGBA of 8
         bits, red lowest. background: in [0, 1], under the ground truth, which is rounded to 8 bits, as
@@ -86,21 +80,17 @@ class ImageLoss:
         levels = frame.pyramid_forward(pixels)
         terms = frame.sum_up()
         if correlated:
-            extra["ncc"] = frame.ncc_backward(pixels, *correlated)
+            extra["ncc"] = frame.ncc_backward({"pixels": pixels, **correlated})
         if levels:
             extra["pyramid"] = frame.pyramid_backward(levels)
-        d_image = self.pool.array("d_image", (4, height, width))
-        kernel = self.kernel("loss_gradient", **{name.upper(): 1 for name in extra})
-        grid = frame.grid(width, height, channels=3)
-        commands.dispatch_grid(kernel, grid, picture=frame.picture, pixels=pixels, d_image=d_image, **extra)
-        return LossArrays(terms, d_image)
+        arrays = {"pixels": pixels, "d_image": self.pool.array("d_image", (4, height, width)), **extra}
+        flags = {name.upper(): 1 for name in extra}
+        frame.run("loss_gradient", frame.grid(width, height, channels=3), arrays, **flags)
+        return terms, arrays["d_image"]
 
     def held(self, truth: DeviceArray) -> DeviceArray:
         """Where a ground truth (H, W) is copied to: all of a training go through one buffer, texture and bind group."""
         return self.pool.array("truth", truth.shape, "uint32")
-
-    def kernel(self, name: str, **defines: int) -> Kernel:
-        return Kernel.get(self.device, name, LANES=self._lanes, **defines)
 
 
 class _Level(NamedTuple):
@@ -145,7 +135,7 @@ class _Frame:
         pixel = 1.0 / (3 * height * width)
         window = 1.0 / max(1, self.ncc_windows)
         per_pixel = window / NCC_WINDOW**2
-        kernel = owner.kernel("loss_pixels")
+        kernel = Kernel.get(owner.device, "loss_pixels", LANES=owner._lanes)
         slope = (weights.l1 + self.flat_pyramid) * pixel, weights.ssim * pixel, weights.ncc * per_pixel, 0.0
         given = {"size": (width, height), "run": owner._run, "background": background, "slope": slope}
         given |= {"ssim_first": self.ends[1], "ncc_first": self.ends[3], "value": (pixel, pixel, window, 0.0)}
@@ -158,54 +148,42 @@ class _Frame:
         """Workgroups for so many lanes, each of which takes a run of the length."""
         return -(-lanes // self.owner._lanes), channels * self.runs(length)
 
+    def run(self, name: str, grid: tuple[int, int], arrays: dict[str, DeviceArray], **defines: int) -> None:
+        """Record a pass with those of the arrays that it binds."""
+        kernel = Kernel.get(self.owner.device, name, LANES=self.owner._lanes, **defines)
+        given = {"picture": self.picture, "sums": self.sums, **arrays}
+        self.commands.dispatch_grid(kernel, grid, **{binding: given[binding] for binding in kernel.bindings})
+
     def pixels(self, image: DeviceArray, truth: DeviceArray) -> DeviceArray:
-        pool = self.owner.pool
         held = self.owner.held(truth)
         if held.buffer is not truth.buffer:
             self.commands.copy(truth, held)
-        pixels = pool.array("pixels", (self.places, 4), "uint32")
-        self.commands.dispatch_grid(
-            self.owner.kernel("loss_pixels"),
-            (1, self.height),
-            picture=self.picture,
-            image=image,
-            rgba=held,
-            pixels=pixels,
-            sums=self.sums,
-        )
+        pixels = self.owner.pool.array("pixels", (self.places, 4), "uint32")
+        self.run("loss_pixels", (1, self.height), {"image": image, "rgba": held, "pixels": pixels})
         return pixels
 
     def ssim(self, pixels: DeviceArray) -> DeviceArray:
         """The derivatives, blurred along the rows."""
         moments = self.owner.pool.array("ssim moments", (3, self.places_across, 4))
         slopes = self.owner.pool.array("ssim slopes", (3, self.places, 4))
-        down, across = self.owner.kernel("loss_ssim_down"), self.owner.kernel("loss_ssim_across")
-        grid = self.grid(self.width, self.height, channels=3)
-        self.commands.dispatch_grid(down, grid, picture=self.picture, pixels=pixels, moments=moments)
-        grid = self.grid(self.height, self.width, channels=3)
-        arrays = {"moments": moments, "slopes": slopes, "sums": self.sums}
-        self.commands.dispatch_grid(across, grid, picture=self.picture, **arrays)
+        arrays = {"pixels": pixels, "moments": moments, "slopes": slopes}
+        self.run("loss_ssim_down", self.grid(self.width, self.height, channels=3), arrays)
+        self.run("loss_ssim_across", self.grid(self.height, self.width, channels=3), arrays)
         return slopes
 
-    def ncc_forward(self, pixels: DeviceArray) -> tuple[DeviceArray, DeviceArray]:
-        """Moments of pixels below each other, and the derivatives, summed over the windows along the rows."""
-        pool, count = self.owner.pool, self.places
-        moments, slopes = (pool.array(f"ncc {name}", (count, 4)) for name in ("moments", "slopes"))
-        halves = {"moments": moments, "truth_variances": pool.array("ncc truth variances", (count,))}
-        down, across = self.owner.kernel("loss_ncc_down"), self.owner.kernel("loss_ncc_across")
-        rows = self.height - NCC_WINDOW + 1
-        grid = self.grid(self.width, rows)
-        self.commands.dispatch_grid(down, grid, picture=self.picture, pixels=pixels, **halves)
-        grid = self.grid(rows, self.width)
-        self.commands.dispatch_grid(across, grid, picture=self.picture, slopes=slopes, sums=self.sums, **halves)
-        return moments, slopes
+    def ncc_forward(self, pixels: DeviceArray) -> dict[str, DeviceArray]:
+        """Moments of pixels below each other, and slopes, the derivatives, summed over the windows along the rows."""
+        pool, rows = self.owner.pool, self.height - NCC_WINDOW + 1
+        found = {name: pool.array(f"ncc {name}", (self.places, 4)) for name in ("moments", "slopes")}
+        arrays = {**found, "pixels": pixels, "truth_variances": pool.array("ncc truth variances", (self.places,))}
+        self.run("loss_ncc_down", self.grid(self.width, rows), arrays)
+        self.run("loss_ncc_across", self.grid(rows, self.width), arrays)
+        return found
 
-    def ncc_backward(self, pixels: DeviceArray, moments: DeviceArray, slopes: DeviceArray) -> DeviceArray:
-        """The gradient by the luminance."""
+    def ncc_backward(self, arrays: dict[str, DeviceArray]) -> DeviceArray:
+        """The gradient by the luminance. arrays: the pixels, and what `ncc_forward` gave."""
         d_luminance = self.owner.pool.array("d_luminance", (self.places,))
-        up, grid = self.owner.kernel("loss_ncc_up"), self.grid(self.width, self.height)
-        arrays = {"pixels": pixels, "moments": moments, "slopes": slopes, "d_luminance": d_luminance}
-        self.commands.dispatch_grid(up, grid, picture=self.picture, **arrays)
+        self.run("loss_ncc_up", self.grid(self.width, self.height), arrays | {"d_luminance": d_luminance})
         return d_luminance
 
     def pyramid_forward(self, pixels: DeviceArray) -> list[_Level]:
@@ -221,68 +199,57 @@ class _Frame:
             (fine_height, fine_width), (height, width) = self.sizes[k : k + 2]
             finest = {"FINEST": 1} if k == 0 else {}
             residual = {"RESIDUAL": 1} if k == bands - 1 else {}
-            reduce = owner.kernel("loss_pyramid_reduce", **finest)
-            band = owner.kernel("loss_pyramid_band", **finest, **residual)
-            uniform = owner.pool.constant(
-                band.uniform(
-                    "Level",
-                    fine=(fine_width, fine_height),
-                    coarse=(width, height),
-                    run=owner._run,
-                    first=first,
-                    value=shares[k],
-                    slope=shares[k] * self.weights.pyramid,
-                    coarse_value=shares[k + 1],
-                    coarse_slope=shares[k + 1] * self.weights.pyramid,
-                ),
+            content = Kernel.get(owner.device, "loss_pyramid_band", LANES=owner._lanes, **finest, **residual).uniform(
+                "Level",
+                fine=(fine_width, fine_height),
+                coarse=(width, height),
+                run=owner._run,
+                first=first,
+                value=shares[k],
+                slope=shares[k] * self.weights.pyramid,
+                coarse_value=shares[k + 1],
+                coarse_slope=shares[k + 1] * self.weights.pyramid,
             )
-            coarse = owner.pool.array(f"level {k + 1}", (height, width, 4))
-            signs = owner.pool.array(f"signs {k}", (fine_height, fine_width), "uint32")
-            columns = -(-width // owner._lanes)
-            self.commands.dispatch_grid(reduce, (columns, height), level=uniform, fine=fine, coarse=coarse)
-            grid = self.grid(width, height)
-            arrays: dict[str, DeviceArray] = {"fine": fine, "coarse": coarse, "signs": signs, "sums": self.sums}
-            self.commands.dispatch_grid(band, grid, level=uniform, **arrays)
-            levels.append(_Level(uniform, coarse, signs))
+            level = _Level(
+                owner.pool.constant(content),
+                owner.pool.array(f"level {k + 1}", (height, width, 4)),
+                owner.pool.array(f"signs {k}", (fine_height, fine_width), "uint32"),
+            )
+            arrays = {"level": level.uniform, "fine": fine, "coarse": level.coarse, "signs": level.signs}
+            self.run("loss_pyramid_reduce", (-(-width // owner._lanes), height), arrays, **finest)
+            self.run("loss_pyramid_band", self.grid(width, height), arrays, **finest, **residual)
+            levels.append(level)
             first += self.pyramid_counts[k]
-            fine = coarse
+            fine = level.coarse
         return levels
 
     def pyramid_backward(self, levels: list[_Level]) -> DeviceArray:
         """The gradient by the difference, from the residual up."""
-        owner = self.owner
-        d_level = levels[-1].coarse  # until there is a gradient
+        owner, arrays = self.owner, dict[str, DeviceArray]()
         for k in range(len(levels), 0, -1):
-            defines = dict[str, int]()
-            arrays: dict[str, DeviceArray] = {"above": levels[k - 1].uniform, "fine_signs": levels[k - 1].signs}
-            if k == len(levels):
-                defines["RESIDUAL"] = 1
-                arrays["difference"] = levels[-1].coarse
-            else:
-                arrays |= {"below": levels[k].uniform, "signs": levels[k].signs, "d_coarse": d_level}
             height, width = self.sizes[k]
             d_level = owner.pool.array(f"d_level {k}", (height, width, 4))
-            kernel = owner.kernel("loss_pyramid_bwd", **defines)
-            self.commands.dispatch_grid(kernel, (-(-width // owner._lanes), height), d_level=d_level, **arrays)
-        difference = owner.pool.array("d_difference", (self.places, 4))
-        (height, width), level = self.sizes[1], levels[0]
-        self.commands.dispatch_grid(
-            owner.kernel("loss_pyramid_finest", FINEST=1),
-            (-(-width // owner._lanes), height),
-            level=level.uniform,
-            signs=level.signs,
-            d_coarse=d_level,
-            d_difference=difference,
-        )
-        return difference
+            arrays |= {"above": levels[k - 1].uniform, "fine_signs": levels[k - 1].signs, "d_level": d_level}
+            if k == len(levels):
+                arrays["difference"] = levels[-1].coarse
+            else:
+                arrays |= {"below": levels[k].uniform, "signs": levels[k].signs}
+            residual = {"RESIDUAL": 1} if k == len(levels) else {}
+            self.run("loss_pyramid_bwd", (-(-width // owner._lanes), height), arrays, **residual)
+            arrays["d_coarse"] = d_level
+        arrays |= {"level": levels[0].uniform, "signs": levels[0].signs}
+        arrays["d_difference"] = owner.pool.array("d_difference", (self.places, 4))
+        height, width = self.sizes[1]
+        self.run("loss_pyramid_finest", (-(-width // owner._lanes), height), arrays, FINEST=1)
+        return arrays["d_difference"]
 
     def sum_up(self) -> DeviceArray:
-        terms = self.owner.pool.array("terms", (TERMS,))
-        kernel = self.owner.kernel("loss_sums")
         names = ("l1", "squared", "ssim", "pyramid", "ncc")
         parts = dict(zip(names, zip([0, *self.ends], self.ends, strict=False), strict=True))
         if self.flat_pyramid:
             parts["pyramid"] = parts["l1"]
-        uniform = self.owner.pool.constant(kernel.uniform("Parts", **parts))
-        self.commands.dispatch_grid(kernel, (TERMS, 1), parts=uniform, sums=self.sums, terms=terms)
-        return terms
+        kernel = Kernel.get(self.owner.device, "loss_sums", LANES=self.owner._lanes)
+        arrays = {"parts": self.owner.pool.constant(kernel.uniform("Parts", **parts))}
+        arrays["terms"] = self.owner.pool.array("terms", (TERMS,))
+        self.run("loss_sums", (TERMS, 1), arrays)
+        return arrays["terms"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,14 +15,6 @@ from lapgs_wgpu.train.config import Rate
 
 ADAM_EPS = 1e-15  # 3DGS's: gradients of single Gaussians are tiny
 LARGEST_FREQUENCY_STEP = 0.02  # cycles over the clip
-
-
-class AdamState(NamedTuple):
-    """Of a parameter: how many steps have moved it, and Adam's two moments, shaped like it."""
-
-    steps: int
-    mean: Tensor
-    square: Tensor
 
 
 class Optimizer:
@@ -100,8 +91,7 @@ class Optimizer:
 
     def moments(self, name: str) -> dict[str, Tensor]:
         """Adam's exp_avg and exp_avg_sq of one of the Gaussians' parameters, shaped like it; empty before any step."""
-        state = self._adam.state.get(self.gaussians[name], {})
-        return {key: state[key] for key in ("exp_avg", "exp_avg_sq") if key in state}
+        return {key: value for key, value in self.state_of(self.gaussians[name]).items() if key != "step"}
 
     def state(self) -> dict[str, Tensor]:
         """Everything that the next step depends on, besides the parameters and their gradients."""
@@ -127,15 +117,13 @@ class Optimizer:
                 if mine:
                     self._adam.state[parameter] = mine
 
-    def state_of(self, parameter: Tensor) -> AdamState | None:
-        """Of a parameter; None before the first step that moves it."""
-        state = self._adam.state.get(parameter)
-        return AdamState(int(state["step"]), state["exp_avg"], state["exp_avg_sq"]) if state else None
+    def state_of(self, parameter: Tensor) -> dict[str, Tensor]:
+        """Adam's step, exp_avg and exp_avg_sq of a parameter; empty before the first step that moves it."""
+        return self._adam.state.get(parameter, {})
 
-    def set_state(self, parameter: Tensor, state: AdamState) -> None:
+    def set_state(self, parameter: Tensor, steps: int, mean: Tensor, square: Tensor) -> None:
         """Go on with this state of a parameter."""
-        values = torch.tensor(float(state.steps)), state.mean, state.square
-        self._adam.state[parameter] = dict(zip(("step", "exp_avg", "exp_avg_sq"), values, strict=True))
+        self._adam.state[parameter] = {"step": torch.tensor(float(steps)), "exp_avg": mean, "exp_avg_sq": square}
 
     def _replace(self, name: str, values: Tensor, moments: Mapping[str, Tensor]) -> None:
         state = self._adam.state.pop(self.gaussians[name], {})

@@ -113,9 +113,10 @@ class ResidentCorrections:
         """Record the gradient by the image, and that by the correction of its colors."""
         if self._exposures is None:
             return d_exposed
-        back = self._exposing.record_bwd(commands, image, d_exposed, self._value("exposures"), self._first_row)
-        sum_columns(commands, self._pool, back.d_rows, self._d_exposure, columns=12)
-        return back.d_image
+        values = self._value("exposures")
+        d_image, d_rows = self._exposing.record_bwd(commands, image, d_exposed, values, self._first_row)
+        sum_columns(commands, self._pool, d_rows, self._d_exposure, columns=12)
+        return d_image
 
     def sum_camera(self, commands: Commands, sums: DeviceArray | None) -> None:
         """Record the gradient by the camera. sums: of `GaussianGradients.camera`."""

@@ -24,7 +24,7 @@ from lapgs_wgpu.motion.fields.laplacian import VARIANCE_FLOOR, VARIANCE_SPREAD
 from lapgs_wgpu.motion.passes.activation_passes import GEOMETRY_FLOATS, SH_FLOATS
 from lapgs_wgpu.motion.passes.field_weights import ALIGNED, FieldWeights
 from lapgs_wgpu.motion.passes.grid_field_passes import FieldArrays
-from lapgs_wgpu.train.optimizer import LARGEST_FREQUENCY_STEP, AdamState, FrequencyOptimizer, Optimizer
+from lapgs_wgpu.train.optimizer import LARGEST_FREQUENCY_STEP, FrequencyOptimizer, Optimizer
 
 _MOST_RATES = 512  # columns with a rate of their own
 KINDS = ("value", "gradient", "mean", "square")
@@ -174,9 +174,9 @@ class ResidentParameters:
         self.push_values()
         for part in [part for part in PARTS if part in self.state_on_host]:
             state = {name: self._optimizer.state_of(tensor) for name, tensor in self._tensors(part).items()}
-            self.steps |= {name: each.steps if each else 0 for name, each in state.items()}
-            for kind in ("mean", "square"):
-                self._write(part, kind, {name: getattr(each, kind, None) for name, each in state.items()})
+            self.steps |= {name: int(each.get("step", 0)) for name, each in state.items()}
+            for kind, key in (("mean", "exp_avg"), ("square", "exp_avg_sq")):
+                self._write(part, kind, {name: each.get(key) for name, each in state.items()})
             if part == "field" and self._frequencies is not None:
                 content, self.steps[FREQUENCIES] = self._frequencies.packed()
                 self._pool.upload("frequencies", content)
@@ -200,7 +200,7 @@ class ResidentParameters:
             self._read(part, "square", squares)
             for name, tensor in tensors.items():
                 if self.steps[name] and name != FREQUENCIES:
-                    self._optimizer.set_state(tensor, AdamState(self.steps[name], means[name], squares[name]))
+                    self._optimizer.set_state(tensor, self.steps[name], means[name], squares[name])
             if part == "field" and self._frequencies is not None:
                 content = self._pool.array("frequencies", self._state_shape).read()
                 self._frequencies.unpack(content, self.steps[FREQUENCIES])
