@@ -57,9 +57,7 @@ def test_configuration_survives_toml(name: str, tmp_path: Path) -> None:
 def test_learning_rates_that_do_not_follow_the_steps_are_named() -> None:
     given = {"schedule.steps": 300, "rates.means.steps": 300}
     told = rates_that_stay(load_config("demo", given), given)
-    assert told.startswith(
-        "schedule.steps is 300, and other keys that count steps stay as they are: rates.hash.steps 1500"
-    )
+    assert told.startswith("schedule.steps is 300, and other keys that count steps stay: rates.hash.steps 1500")
     assert not rates_that_stay(load_config("demo"), {"schedule.steps": 1500})
     assert not rates_that_stay(load_config("dnerf"), {})
 

@@ -74,8 +74,7 @@ def unpack_tensors(file: BinaryIO, size: int, where: str) -> tuple[dict[str, Arr
     for ((begin, end), _, _), name in entries:  # before anything is read: they follow one another without a gap
         if begin != position:
             raise InputError(
-                f"{where}: tensor {name[:80]!r} begins at byte {begin}, but the one before it ends at {position}; "
-                "the file is damaged"
+                f"{where}: tensor {name[:80]!r} begins at byte {begin}, not at {position}; the file is damaged"
             )
         position = end
     if position != rest:

@@ -109,10 +109,7 @@ def rates_that_stay(config: Config, given: Mapping[str, Any]) -> str:
     ]
     if "schedule.steps" not in given or not fixed:
         return ""
-    return (
-        f"schedule.steps is {config.schedule.steps}, and other keys that count steps stay as they are: "
-        f"{', '.join(fixed)}."
-    )
+    return f"schedule.steps is {config.schedule.steps}, and other keys that count steps stay: {', '.join(fixed)}."
 
 
 def _shorthands(method: str | None, ablate: Iterable[str]) -> dict[str, Any]:

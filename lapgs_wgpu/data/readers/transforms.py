@@ -48,8 +48,7 @@ def _read_frames(data: Fields, files: CaptureFiles, time: str) -> list[Frame | N
     for entry in entries:
         if timed and not _states(entry, time):
             raise InputError(
-                f"{entry.where} has no field {time}, though {timed} of {len(entries)} frames have it; give it for all "
-                "frames or for none."
+                f"{entry.where} has no field {time}, though {timed} of {len(entries)} frames have it; give it for all."
             )
         stated = number(entry.required(time), time, entry.where) if timed else None
         pose = opengl_pose(entry.required("transform_matrix"), entry.where)
@@ -81,8 +80,7 @@ def read_lens(frame: Fields, shared: Fields, image: ImageFile) -> tuple[Lens, bo
     if model not in MODELS or source("is_fisheye").values.get("is_fisheye"):
         named = kind(model) if model not in MODELS else "is_fisheye"
         raise InputError(
-            f"{frame.where}: camera_model {named} is not among those that are read ({', '.join(MODELS)}); undistort "
-            "the images first."
+            f"{frame.where}: camera_model {named} is none that is read ({', '.join(MODELS)}); undistort the images."
         )
     values = {
         name: source(name).number(name, least, most)

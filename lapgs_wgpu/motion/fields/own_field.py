@@ -44,8 +44,7 @@ class OwnField(nn.Module):
         name = type(self.module).__name__
         if not isinstance(move, Deformation):
             raise InputError(
-                f"the field {name}, which is called with means and then t, must return a Tensor or a Deformation, got "
-                f"{type(move).__name__}."
+                f"the field {name} (means, t) must return a Tensor or a Deformation, got {type(move).__name__}."
             )
         for part, row in _ROWS.items():
             values = getattr(move, part)
