@@ -52,10 +52,7 @@ def bench_raster(
     d_image = DeviceArray.upload(device, "d_image", gradient)
 
     def forward() -> Drawing:
-        while True:
-            drawing = rasterizer.draw(gaussians, camera)
-            if not rasterizer.grow_on_overflow(drawing):  # which waits
-                return drawing
+        return rasterizer.draw_whole(gaussians, camera)
 
     def forward_backward() -> None:
         drawing = rasterizer.draw(gaussians, camera)

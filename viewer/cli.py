@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -150,7 +150,7 @@ def _video(given: Any, scene: LoadedScene) -> None:
 
     if path == "time":
         camera = framed(view.camera, *size) if view else scene.camera().camera(*size)
-        cameras = ((camera, share) for share in np.linspace(0, 1, frames).tolist())
+        cameras: Iterator[video.TimedCamera] = ((camera, share) for share in np.linspace(0, 1, frames).tolist())
     else:
         start, arc, time = scene.camera(), scene.initial_view.arc, 0.0
         if view is not None:

@@ -75,11 +75,8 @@ def _draw(
     rasterizer: Rasterizer, scene: LoadedScene, gaussians: Gaussians[DeviceArray], camera: Camera
 ) -> NDArray[np.float32]:
     """Draw an image (3, height, width), clipped to [0, 1]."""
-    while True:
-        drawing = rasterizer.draw(gaussians, camera, scene.background)
-        if not rasterizer.grow_on_overflow(drawing):
-            image: NDArray[np.float32] = drawing.image.read()[:3].clip(0, 1)
-            return image
+    image: NDArray[np.float32] = rasterizer.draw_whole(gaussians, camera, scene.background).image.read()
+    return image[:3].clip(0, 1)
 
 
 def _psnr(true: Floats, found: Floats) -> float:

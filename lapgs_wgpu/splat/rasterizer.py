@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,6 +76,12 @@ class Rasterizer:
             drawing = self.record(commands, gaussians, camera, background, depth=depth, gradient=gradient)
         if self._subgroup_mismatch("rasterize", drawing):
             return self.draw(gaussians, camera, background, depth=depth, gradient=gradient)
+        return drawing
+
+    def draw_whole(self, *given: Any, **how: Any) -> Drawing:
+        """Draw with the arguments of `draw` until the buffers are large enough. Waits for the device."""
+        while self.grow_on_overflow(drawing := self.draw(*given, **how)):
+            pass
         return drawing
 
     def record(
@@ -251,7 +258,8 @@ class Rasterizer:
         with Commands(self.device) as commands:
             gradients = self.record_bwd(commands, drawing, d_image, camera=camera)
         if self._subgroup_mismatch("rasterize_bwd", drawing):
-            return self.backward(self._drawn_again(drawing), d_image, camera=camera)
+            given, depth = (drawing.gaussians, drawing.camera, drawing.background), drawing.depth
+            return self.backward(self.draw_whole(*given, depth=depth, gradient=True), d_image, camera=camera)
         return gradients
 
     def record_bwd(
@@ -288,13 +296,6 @@ class Rasterizer:
             shifted = {"frame": arrays["frame"], "d_means": d_means, "d_camera": d_camera.rows(1, 1)}
             commands.run(Kernel.get(self.device, "camera_bwd", FORCE=True), _groups(n), shifted)
         return GaussianGradients(d_splats, d_means, d_quats, d_scales, d_sh, d_camera)
-
-    def _drawn_again(self, drawing: Drawing) -> Drawing:
-        """Return the same image, drawn with the present config."""
-        gaussians, camera, background, depth = drawing.gaussians, drawing.camera, drawing.background, drawing.depth
-        while self.grow_on_overflow(again := self.draw(gaussians, camera, background, depth=depth, gradient=True)):
-            pass
-        return again
 
     def _backward_band(
         self, commands: Commands, drawing: Drawing, band: int, d_image: DeviceArray, d_splats: DeviceArray

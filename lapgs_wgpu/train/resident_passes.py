@@ -132,9 +132,7 @@ class ResidentPasses:
         with Commands(self._device) as commands:
             drawn = self._activate(commands, task.sh_degree, None)
         d_image = self._losses.pool.array("d_image", (4, camera.height, camera.width))
-        while self.rasterizer.grow_on_overflow(drawing := self.rasterizer.draw(drawn, camera, gradient=True)):
-            pass
-        self.rasterizer.backward(drawing, d_image)
+        self.rasterizer.backward(self.rasterizer.draw_whole(drawn, camera, gradient=True), d_image)
 
     def _recorded(self, commands: Commands, task: Task, truth: DeviceArray, *, judged: bool) -> Recorded:
         camera, plan = task.view.camera, self.rasterizer.plan_of(task.view.camera)

@@ -64,7 +64,8 @@ def resolve_for_dataset(config: Config, dataset: Dataset) -> Config:
     """
     if config.timing.refine and len(dataset.times) > MOST_TIMES:
         raise InputError(
-            f"{dataset.name} has {len(dataset.times)} times, over timing.refine's {MOST_TIMES}; give --timing.refine false."
+            f"{dataset.name} has {len(dataset.times)} times, and timing.refine takes {MOST_TIMES} at most; give "
+            "--timing.refine false."
         )
     field = config.field
     if config.data.units == "capture":
