@@ -49,7 +49,7 @@ def bench_encoder(
     d_encodings = [torch.randn(len(points), grid.features, generator=generator) for grid in grids]
 
     def kernels() -> list[Tensor]:
-        return encoder(points, TIME)
+        return encoder.encode_all([(points, TIME)])[0]
 
     def reference() -> list[Tensor]:
         return [encode_reference(grid, grid.table, points, TIME, config.bound) for grid in grids]

@@ -61,7 +61,7 @@ def run(encoder: HashEncoder, points: Tensor, time: float, seed: int = 0) -> tup
     """Encodings, and the gradients of the tables for random gradients of the encodings."""
     for grid in encoder.grids:
         grid.table.grad = None
-    encodings = encoder(points, time)
+    (encodings,) = encoder.encode_all([(points, time)])
     generator = torch.Generator().manual_seed(seed)
     torch.autograd.backward(encodings, [torch.randn(*e.shape, generator=generator) for e in encodings])
     gradients = [grid.table.grad for grid in encoder.grids]
@@ -153,7 +153,7 @@ def test_grids_of_a_group_lie_beside_one_another(device: Device, lane_levels: bo
     encodings, upstream, gradients = [], [], []
     for group in (apart, lambda grids: [grids[:1], grids[1:]]):
         encoder = HashEncoder(device, group(make_grids(*names)), BOUND, lane_levels=lane_levels)
-        found = encoder(points, time)
+        (found,) = encoder.encode_all([(points, time)])
         encodings.append(torch.cat(found, dim=1))
         generator = torch.Generator().manual_seed(0)
         upstream = list(torch.randn(encodings[0].shape, generator=generator).split([e.shape[1] for e in found], dim=1))
@@ -269,7 +269,7 @@ def test_gradients_of_any_size(device: Device, lane_levels: bool, size: float) -
 def test_gradients_that_are_not_finite_stay_so(device: Device, bad: float, *, lane_levels: bool) -> None:
     grids = make_grids("dense", "sliced")
     encoder = HashEncoder(device, apart(grids), BOUND, lane_levels=lane_levels)
-    encodings = encoder(random_points(100), 0.4)
+    (encodings,) = encoder.encode_all([(random_points(100), 0.4)])
     upstream = [torch.ones_like(e) for e in encodings]
     for d in upstream:
         d[40, 3] = bad
@@ -299,7 +299,7 @@ def test_gradients_reach_the_tables_and_not_the_points(device: Device) -> None:
     grids = make_grids("dense", "sliced")
     encoder = HashEncoder(device, apart(grids), BOUND)
     points = random_points(100).requires_grad_()
-    first, _ = encoder(points, 0.2)
+    ((first, _),) = encoder.encode_all([(points, 0.2)])
     first.square().sum().backward()
     assert points.grad is None
     assert grids[0].table.grad is not None
@@ -312,9 +312,9 @@ def test_tables_are_read_anew_at_each_call(device: Device) -> None:
     grids = make_grids("dense", "sliced")
     encoder = HashEncoder(device, apart(grids), BOUND)
     points = random_points(50)
-    before = [e.detach() for e in encoder(points, 0.2)]
+    before = [e.detach() for e in encoder.encode_all([(points, 0.2)])[0]]
     with torch.no_grad():
         for grid in grids:
             grid.table *= 2
-    for a, b in zip(before, encoder(points, 0.2), strict=True):
+    for a, b in zip(before, encoder.encode_all([(points, 0.2)])[0], strict=True):
         torch.testing.assert_close(2 * a, b.detach())

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion, TimeMotion
 from lapgs_wgpu.train.config import Rate
 from lapgs_wgpu.train.optimizer import FrequencyOptimizer
@@ -16,7 +17,7 @@ K, WIDTH, INPUTS = 5, 6, 4
 
 
 def motion(frequencies: list[float] | None = None, seed: int = 0) -> LaplacianMotion:
-    made = LaplacianMotion(INPUTS, WIDTH, K, torch.Generator().manual_seed(seed)).double()
+    made = LaplacianMotion(INPUTS, FieldConfig(width=WIDTH, components=K), torch.Generator().manual_seed(seed)).double()
     if frequencies is not None:
         with torch.no_grad():
             made.frequencies.copy_(torch.tensor(frequencies))
@@ -34,7 +35,9 @@ def features(m: LaplacianMotion | TimeMotion, t: float) -> Tensor:
 def test_the_spectrum_at_the_start() -> None:
     """Whole cycles, faint in all, and falling like 1 / f whatever the number of components is."""
     assert motion().frequencies.tolist() == [0, 1, 2, 3, 4]
-    wide = LaplacianMotion(2, 4000, 25, torch.Generator().manual_seed(0), frequency_step=0.5)
+    wide = LaplacianMotion(
+        2, FieldConfig(width=4000, components=25, frequency_step=0.5), torch.Generator().manual_seed(0)
+    )
     assert wide.frequencies.tolist() == [0.5 * k for k in range(25)]
     assert float(wide.series(0.3).detach().std()) == pytest.approx(0.3, rel=0.05)
     amplitudes = wide.amplitudes()
@@ -147,7 +150,7 @@ def test_frequencies_stay_below_nyquist_and_steps_are_bounded() -> None:
 def test_frequencies_find_a_motion() -> None:
     """Two tones of 1.3 and 2.6 cycles from a start at 1 and 3: the factor does not keep them from converging."""
     generator = torch.Generator().manual_seed(2)
-    m = LaplacianMotion(INPUTS, WIDTH, 2, torch.Generator().manual_seed(0))
+    m = LaplacianMotion(INPUTS, FieldConfig(width=WIDTH, components=2), torch.Generator().manual_seed(0))
     with torch.no_grad():
         m.frequencies.copy_(torch.tensor([1.0, 3.0]))
     mixing = torch.randn(2, WIDTH, generator=torch.Generator().manual_seed(1))

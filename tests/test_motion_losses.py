@@ -84,8 +84,7 @@ def test_times_lie_half_to_whole_the_reach_apart() -> None:
         assert len(samples.rows) == 20
         assert 0.01 <= 0.5 - samples.times[0] <= 0.02
         assert samples.times[1] - 0.5 == pytest.approx(0.5 - samples.times[0])
-    near_end = draw_times(20, 40, 0.995, 101, generator)
-    assert near_end.times[1] == 1
+    assert draw_times(20, 40, 0.995, 101, generator).times[1] == 1
 
 
 @pytest.mark.parametrize(

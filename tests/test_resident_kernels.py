@@ -17,6 +17,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.matmul import sum_columns
 from lapgs_wgpu.gpu.pool import BufferPool
+from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.dynamics import dynamics_loss
 from lapgs_wgpu.motion.fields.laplacian import VARIANCE_FLOOR, VARIANCE_SPREAD, LaplacianMotion
 from lapgs_wgpu.motion.passes.samples import SamplePasses, Samples
@@ -74,7 +75,7 @@ def test_adam(device: Device, rows: int, columns: int, guard: int) -> None:
 
 def test_adam_of_the_frequencies(device: Device) -> None:
     width, components, rate, limit = 20, 5, 3e-2, 3.5
-    motion = LaplacianMotion(4, width, components, torch.Generator().manual_seed(0))
+    motion = LaplacianMotion(4, FieldConfig(width=width, components=components), torch.Generator().manual_seed(0))
     optimizer = FrequencyOptimizer(motion, Rate(rate, rate, 1), limit)
     flat = torch.cat([motion.alpha.detach().flatten(), motion.beta.detach().flatten(), motion.frequencies.detach()])
     kernel, first = Kernel.get(device, "adam_frequencies"), 2 * width * components

@@ -34,7 +34,6 @@ class GridField(nn.Module):
         super().__init__()
         generator = torch.Generator().manual_seed(seed)
         ours = config.kind == "laplacian"
-        width = config.width
         self.config = config
         self.static_grid = HashGrid(config.static, (0, 1, 2), generator)
         axes = TEMPORAL_AXES if config.temporal_hash else ()
@@ -50,16 +49,9 @@ class GridField(nn.Module):
         self.heads = zero_head(shapes["heads.weight"])
         self.motion: LaplacianMotion | TimeMotion | None = None
         if ours and config.motion == "laplacian":
-            self.motion = LaplacianMotion(
-                static,
-                width,
-                config.components,
-                generator,
-                frequency_step=config.frequency_step,
-                amplitude=config.amplitude,
-            )
+            self.motion = LaplacianMotion(static, config, generator)
         elif ours:
-            self.motion = TimeMotion(static, width, generator)
+            self.motion = TimeMotion(static, config.width, generator)
         self.appearance = zero_head(shapes["appearance.weight"]) if config.appearance_size else None
 
     @property

@@ -62,15 +62,11 @@ class HashEncoder:
         """Length of a point's encoding, for each group."""
         return [sum(grid.features for grid in group) for group in self.groups]
 
-    def __call__(self, points: Tensor, time: float = 0.0) -> list[Tensor]:
-        """Encode points (N, 3), world units, at a time in [0, 1]: an (N, features) float32 tensor for each group.
+    def encode_all(self, places: Sequence[Place]) -> list[list[Tensor]]:
+        """Encode sets of points, each at its own time: of each an (N, features) float32 tensor for each group.
 
         Differentiable in the tables, not in the points. Outside the box [-bound, bound]^3 the features are zero.
         """
-        return self.encode_all([(points, time)])[0]
-
-    def encode_all(self, places: Sequence[Place]) -> list[list[Tensor]]:
-        """Encode several sets of points, each at its own time; the tables are uploaded once."""
         detached = [(points.detach(), time) for points, time in places]
         outputs = _Encode.apply(self, detached, *[grid.table for grid in self.grids])
         count = len(self.groups)

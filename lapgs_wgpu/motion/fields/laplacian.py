@@ -7,14 +7,13 @@ import math
 import torch
 from torch import Tensor, nn
 
+from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.layers import linear
 from lapgs_wgpu.motion.fields.parameter_shapes import laplacian_motion, time_motion
 
 VARIANCE_FLOOR = 1e-4
-VARIANCE_SPREAD = (
-    10.0  # a component's variance counts as at most this times the geometric mean of all, and at least 1/this
-)
-
+# A component's variance counts as at most this times the geometric mean of all, and at least 1 / this.
+VARIANCE_SPREAD = 10.0
 
 Layer = tuple[Tensor, Tensor]  # weight (outputs, inputs) and bias (outputs,)
 
@@ -27,25 +26,16 @@ class LaplacianMotion(nn.Module):
     M: two layers on the static features H_s, which select each Gaussian's part of the motion.
     """
 
-    def __init__(
-        self,
-        inputs: int,
-        width: int,
-        components: int,
-        generator: torch.Generator,
-        *,
-        frequency_step: float = 1.0,
-        amplitude: float = 0.3,
-    ) -> None:
+    def __init__(self, inputs: int, config: FieldConfig, generator: torch.Generator) -> None:
         super().__init__()
         # Small, and smaller at higher frequencies, as in smooth motion: otherwise the heads would learn to explain
         # single images by flicker. Not zero: if both factors were zero, the product would have no gradient.
-        shapes = laplacian_motion(inputs, width, components)
-        fall = 1.0 / torch.arange(components).clamp(min=1)[:, None]
-        size = amplitude * fall / fall.square().sum().sqrt()
+        shapes = laplacian_motion(inputs, config.width, config.components)
+        fall = 1.0 / torch.arange(config.components).clamp(min=1)[:, None]
+        size = config.amplitude * fall / fall.square().sum().sqrt()
         self.alpha = nn.Parameter(torch.randn(shapes["alpha"], generator=generator) * size)
         self.beta = nn.Parameter(torch.randn(shapes["beta"], generator=generator) * size)
-        self.frequencies = nn.Parameter(frequency_step * torch.arange(components, dtype=torch.float32))
+        self.frequencies = nn.Parameter(config.frequency_step * torch.arange(config.components, dtype=torch.float32))
         self.first = linear(shapes["first.weight"], generator)
         self.second = linear(shapes["second.weight"], generator)
 
