@@ -59,11 +59,8 @@ def test_pruning_keeps_the_largest_whatever_they_contribute(device: Device, monk
     monkeypatch.setattr(density_control, "contributions", lambda *_, **options: most)
     monkeypatch.setattr(density_control, "LEAST_KEPT", 3)
     optimizer = Optimizer(scene.parameters, {}, config.rates.schedules())
-    learn, data = (
-        SimpleNamespace(optimizer=optimizer, camera=lambda v: v.camera),
-        SimpleNamespace(train=shown, extent=1),
-    )
-    control = density_control.DensityControl(config, scene, learn, published_rule, data, torch.Generator())
+    data, of = SimpleNamespace(train=shown, extent=1), SimpleNamespace(optimizer=optimizer, camera=lambda v: v.camera)
+    control = density_control.DensityControl(config, scene, of, published_rule, data, torch.Generator())
     kept = scene.parameters["means"].detach()[most >= most.sort().values[-3]]
     control.change(4, moving=True)
     assert torch.equal(scene.parameters["means"], kept)
