@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lapgs_wgpu.gpu.array import DeviceArray
-from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
-from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.fields.laplacian import VARIANCE_FLOOR, VARIANCE_SPREAD
 from lapgs_wgpu.motion.passes.activation_passes import GEOMETRY_FLOATS, SH_FLOATS
 from lapgs_wgpu.motion.passes.field_weights import ALIGNED, FieldWeights
 from lapgs_wgpu.motion.passes.grid_field_passes import FieldArrays
-from lapgs_wgpu.train.optimizer import LARGEST_FREQUENCY_STEP, FrequencyOptimizer, Optimizer
+from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.train.learners import Learners
+from lapgs_wgpu.train.optimizer import LARGEST_FREQUENCY_STEP
 
 _MOST_RATES = 512  # columns with a rate of their own
 KINDS = ("value", "gradient", "mean", "square")
@@ -83,19 +83,10 @@ class ResidentParameters:
     steps: by name of a tensor, how many steps have moved it.
     """
 
-    def __init__(
-        self,
-        device: Device,
-        gaussians: Mapping[str, Tensor],
-        field_module: GridField | None,
-        weights: FieldWeights | None,
-        optimizer: Optimizer,
-        frequencies: FrequencyOptimizer | None,
-    ) -> None:
-        self._device, self._pool = device, BufferPool(device)
-        self._gaussians, self._optimizer, self._frequencies = gaussians, optimizer, frequencies
-        self._field = dict(field_module.named_parameters()) if field_module is not None else {}
-        self._weights = weights
+    def __init__(self, scene: Scene4D, weights: FieldWeights | None, learners: Learners) -> None:
+        self._device, self._pool, self._weights = scene.device, BufferPool(scene.device), weights
+        self._gaussians, self._optimizer, self._frequencies = scene.parameters, learners.optimizer, learners.frequencies
+        self._field = dict(scene.field.named_parameters()) if scene.field is not None else {}
         self.blocks: dict[str, Block] = {}
         self._arrays: dict[tuple[str, str], DeviceArray] = {}  # of all blocks together, by part and kind
         self.steps: dict[str, int] = {}

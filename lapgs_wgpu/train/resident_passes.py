@@ -75,12 +75,8 @@ class ResidentPasses:
 
     def __init__(self, config: Config, scene: Scene4D, learners: Learners) -> None:
         self._config, self._scene, self._device = config, scene, scene.device
-        field = scene.field if isinstance(scene.field, GridField) else None
-        self._field = GridFieldPasses(scene.device, scene.field_config) if field else None
-        weights = self._field.weights if self._field else None
-        self.parameters = ResidentParameters(
-            scene.device, scene.parameters, field, weights, learners.optimizer, learners.frequencies
-        )
+        self._field = GridFieldPasses(scene.device, scene.field_config) if isinstance(scene.field, GridField) else None
+        self.parameters = ResidentParameters(scene, self._field.weights if self._field else None, learners)
         self.corrections = ResidentCorrections(scene.device, learners)
         self._activation = ActivationPasses(scene.device, scene.field_config)
         self.rasterizer, self._losses = rasterizer_of(scene.device), image_loss_of(scene.device)
