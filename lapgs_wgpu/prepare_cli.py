@@ -85,7 +85,7 @@ def _prepare(arguments: list[str]) -> None:
     if given.train:
         _train(capture, run, given.minutes, diagnosis)
     elif not given.check:
-        print(f"{beside('lapgs-prepare')} --check {quoted(capture)} --train")
+        print(f"to train: {beside('lapgs-prepare')} --check {quoted(capture)} --train --minutes 20")
 
 
 def check_options(given: argparse.Namespace) -> None:

@@ -84,7 +84,7 @@ def parse_options(arguments: list[str]) -> dict[str, typing.Any]:
         "grid4d (Grid4D) or laplacian (the paper's). All but laplacian also turn off the paper's losses (loss.pyramid, "
         "loss.ncc) and its adaptive split (density.split) [the preset's]")
     add("--ablate", metavar="PART[,PART]", help=f"turn off parts of the paper's method, comma-separated: {parts}")
-    add("--out", metavar="RUN", help="run folder for all output; must be new or empty, but for --overwrite "
+    add("--out", metavar="RUN", help="run folder for all output; must be new or empty, unless --overwrite is given "
         "[runs/SCENE-PRESET in the current folder; SCENE: name of the capture's folder]")
     add("--resume", metavar="RUN", help="continue the interrupted training in run folder RUN from its last saved "
         "state. Can be combined with --view, --device, --lpips-weights, --cache-gb, --data (where the capture is now) "

@@ -15,7 +15,7 @@ from lapgs_wgpu.data.images import encode_png
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.capture import prepare
 from lapgs_wgpu.prepare.flow import Motion
-from lapgs_wgpu.prepare.movers import depth_errors, in_mask, read_masks, rim, without
+from lapgs_wgpu.prepare.movers import Judged, depth_errors, in_mask, read_masks, rim, without
 
 pycolmap = pytest.importorskip("pycolmap")
 pytest.importorskip("av")
@@ -171,3 +171,17 @@ def test_matches_without_masked_features() -> None:
     matches = {("a", "b"): np.array([[0, 1], [1, 1], [2, 0]])}
     found = without(matches, {"a": places, "b": places}, {"a": mask}, size)
     assert found["a", "b"].tolist() == [[1, 1], [2, 0]]
+
+
+def test_cameras_that_follow_what_moves_in_a_part_of_the_film() -> None:
+    """In the first image they fit its left quarter alone, in the second all but that: both see it move."""
+    moves, names = np.zeros((9, 12), bool), ["a", "b"]
+    moves[:, :3] = True
+    errors = [np.where(moves, 1.0, 8.0).astype(np.float32), np.where(moves, 20.0, 1.0).astype(np.float32)]
+    wrong = Judged(errors, [np.log(each) for each in errors], float(np.log(5)), 0.3)
+    right = wrong._replace(errors=errors[1:] * 2)
+    assert wrong.contradicted(names) == ["a"]
+    assert right.contradicted(names) == []
+    assert right.explained(wrong) == pytest.approx(1.5) == 1 / wrong.explained(right)
+    shares = [mask.mean() for mask in wrong.turned_over(names).values()]
+    assert shares == [pytest.approx(1 / 3)] * 2  # one place wider than a quarter

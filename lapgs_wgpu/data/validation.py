@@ -100,8 +100,8 @@ def _black_cameras(frames: Sequence[Frame]) -> list[str]:
     if not black:
         return []
     return [
-        f"camera {black[0]} is black (one of {len(black)} of {len(several)}): in {len(several[black[0]])} of its "
-        f"{len(by_camera[black[0]])} images, such as {several[black[0]][0]}, no level reaches {BLACK}: leave it out."
+        f"{len(black)} of {len(several)} cameras are black, such as {black[0]}: in {len(several[black[0]])} of its "
+        f"{len(by_camera[black[0]])} images, such as {several[black[0]][0]}, no level reaches {BLACK}: leave them out."
     ]
 
 

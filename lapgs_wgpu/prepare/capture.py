@@ -33,6 +33,7 @@ LENS = "RADIAL"
 FEWEST, WHOLE = 0.3, 0.9  # of the images need a pose; of fewer than this only a part of the film fits
 LITTLE, MUCH = 0.002, 0.15  # share of the images: less motion needs no masks; more may have led the cameras astray
 FOLLOWED, UNKNOWN = 0.8, 0.2  # share of the image area where flow must tell whether it moves; less makes no masks
+AGAIN = 0.98  # of the area that was explained before, at least, by cameras without what moves
 STANDING = 4e-3  # of the longer side: the image of a camera that stands still moves less over the film
 FEATURES, SHARED = 200, 60  # of an image; in common with the next one: fewer say why cameras are not found
 
@@ -169,18 +170,22 @@ def _without_movers(
 ) -> tuple[Found, dict[str, Mask]]:
     """Find what moves, and place the cameras again without it.
 
-    A reconstruction follows whatever its features agree on most, which may be what moves. Where much of the images
-    disagrees, one is made of their rims alone, and the one that explains more of the images' area is right.
+    A reconstruction follows whatever its features agree on most, which may be what moves, in all images or in some.
+    Where much of the images disagrees, one is made of their rims, and one of what disagrees; the one that explains most
+    of the images' area is right.
     """
     seen = judge(motion, source.names, found.model)
-    if seen.moving > MUCH and found.pan is None:
-        say(f"{seen.moving:.0%} of the image area disagrees with the first cameras: trying the images' rims alone.")
-        source.use(without(matches, source.places, dict.fromkeys(source.names, rim()), size))
+    for rims in (True, False):
+        if seen.moving <= MUCH or found.pan is not None:
+            break
+        of = "the images' rims" if rims else "what disagrees"
+        say(f"{seen.moving:.0%} of the image area disagrees with these cameras: trying {of} alone.")
+        hidden = dict.fromkeys(source.names, rim()) if rims else seen.turned_over(source.names)
+        source.use(without(matches, source.places, hidden, size))
         other = search(source, size, rival=True)
         if other is not None and len(other.placed) >= FEWEST * len(source.names):
             judged = judge(motion, source.names, other.model)
-            limit = min(seen.noise, judged.noise)  # what is nearly rigid fits a wrong reconstruction nearly
-            if judged.still(limit) > seen.still(limit):
+            if judged.explained(seen) > 1:
                 found, seen = other, judged
     if seen.followed < FOLLOWED:
         say(
@@ -190,9 +195,16 @@ def _without_movers(
     if seen.moving > LITTLE:
         say(f"{seen.moving:.1%} of the image area moves: masked, and the cameras are placed again.")
         other = again(source, found, matches, seen.rough(source.names), size)
-        kept = other is not None and len(other.placed) >= len(found.placed) and len(other.faults) <= len(found.faults)
-        if other is not None and kept:  # else the masks took too much
-            found, seen = other, judge(motion, source.names, other.model)
+        if other is not None and len(other.placed) >= len(found.placed) and len(other.faults) <= len(found.faults):
+            judged = judge(motion, source.names, other.model)
+            if judged.explained(seen) > AGAIN:  # else the masks took too much
+                found, seen = other, judged
+    if found.pan is None and (wrong := seen.contradicted(source.names)):
+        say(
+            f"more than half of what {len(wrong)} of {len(source.names)} images show, from {wrong[0]} to {wrong[-1]}, "
+            "does not fit their cameras, which may follow what moves: leave out that part of the film, or mask what "
+            "moves (--masks)."
+        )
     return found, cut_out(motion, source.names, seen) if seen.followed > UNKNOWN else {}
 
 

@@ -225,7 +225,7 @@ def exposure(looks: Sequence[Look], points: Floats | None) -> Measure:
         if len(gains) >= 3:
             stops = float(np.ptp(np.percentile(gains, [5, 95])))
             value = f"changes by {stops:.2f} stops between dark and bright images"
-            advice = "lock exposure and white balance; --exposure.enabled true corrects each image's colors"
+            advice = "lock exposure and white balance; --train corrects each image's colors"
     return Measure("exposure", stops, value, 0, 0.3, "0.3 stops or less", advice)
 
 

@@ -55,15 +55,34 @@ class Judged(NamedTuple):
         known = [np.isfinite(errors).mean() for errors in self.errors]
         return float(np.mean([share for share in known if share] or [0.0]))
 
-    def still(self, noise: float) -> float:
-        """Share of the images' area that is explained up to SHARP times a noise in pixels."""
-        return float(np.mean([(errors * self.noise < SHARP * noise).mean() for errors in self.errors]))
+    def explained(self, other: Judged) -> float:
+        """How much of the images' area still points explain, in times of what they explain in another one, at the noise
+        of the better of the two: what is nearly rigid fits wrong cameras nearly."""
+        limit = SHARP * min(self.noise, other.noise)
+        mine, others = (float(np.mean([e * each.noise < limit for e in each.errors])) for each in (self, other))
+        return mine / max(others, 1e-9)
+
+    def contradicted(self, names: Sequence[str]) -> list[str]:
+        """The images of which more than half of the known area is off by MOVES times the noise or more."""
+        pairs = zip(names, self.errors, strict=True)
+        return [name for name, errors in pairs if (errors > MOVES).sum() > 0.5 * max(np.isfinite(errors).sum(), 1)]
 
     def rough(self, names: Sequence[str]) -> dict[str, Mask]:
         """Masks on the grid, a little wider than what moves."""
         cv2 = import_cv2()
         masks = [(vote > self.limit).astype(np.uint8) for vote in self.votes]
         return {name: cv2.dilate(mask, np.ones((3, 3), np.uint8)) > 0 for name, mask in zip(names, masks, strict=True)}
+
+    def turned_over(self, names: Sequence[str]) -> dict[str, Mask]:
+        """Masks on the grid of what agrees, a little wider, in images that disagree at least half as much as the worst
+        one: their cameras may follow what moves. Of the others as `rough`."""
+        cv2 = import_cv2()
+        shares = [(vote > self.limit).mean() for vote in self.votes]
+        masks = self.rough(names)
+        for name, errors, share in zip(names, self.errors, shares, strict=True):
+            if share >= max(shares) / 2:
+                masks[name] = cv2.dilate((errors < SHARP).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        return masks
 
 
 def judge(motion: Motion, names: Sequence[str], model: Any) -> Judged:

@@ -37,11 +37,11 @@ class DataConfig(Options):
         "world",
     )
     masks: str = option(
-        "folder with a mask for each training image; the loss ignores white pixels; such as masks/ of lapgs-prepare", ""
+        "folder with a mask for each training image; the loss ignores white pixels, so they are not trained", ""
     )
     movers: str = option(
-        "folder, absolute or in the capture, with a mask for each image, white where something moves: there movers are "
-        "looked for and measured; masks: that of lapgs-prepare",
+        "folder, absolute or in the capture, with a mask for each image, white where something moves: discovery looks "
+        "for it there alone, and the evaluation measures it apart; lapgs-prepare writes the folder masks",
         "",
     )
     path: str = option(
@@ -226,7 +226,11 @@ class DiscoveryConfig(Options):
     steps: int = option("training steps of the static fit that discovery begins with", 800, at_least=1)
     size: int = option("longer side of the images for discovery, pixels", 100, at_least=16)
     field_steps: int = option("steps that fit the field to the motion that was found", 1500, at_least=1)
-    least: float = option("use what was found only if it explains this fraction of the moving points", 0.05, at_most=1)
+    least: float = option(
+        "start without what was found where it covers less than this fraction of what the static fit lacks",
+        0.05,
+        at_most=1,
+    )
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.host import environment, step_threads
 from lapgs_wgpu.train.presets import write_toml
 
-LOST = 0.5  # share of the moving pixels; where fewer are drawn as they are, that is a warning
+LOST = 0.8  # share of the moving pixels; where fewer are drawn as they are, that is a warning
 STATE = "state.safetensors"
 RUN_FILES = (
     "config.toml", "log.jsonl", "metrics.json", "metrics.csv", "checkpoint.ply", "eval", "tensorboard",

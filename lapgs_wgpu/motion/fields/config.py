@@ -49,7 +49,7 @@ class FieldConfig(Options):
     )
     bound: float = option("half side length of the field's cube, world units", 1.6, above=0, below=1e6)
     unit: float = option(
-        "how fast things learn to move and to change their size: the length that an output of 1 moves, world units",
+        "how far an output of 1 moves a Gaussian, world units; more lets things learn to move and change size faster",
         1.0,
         above=0,
         below=1e6,
