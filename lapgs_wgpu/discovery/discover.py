@@ -12,6 +12,7 @@ from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.discovery.acceptance import explained_share, rows_with, tracks_in_images
 from lapgs_wgpu.discovery.cutouts import cutout_tracks
 from lapgs_wgpu.discovery.field_fit import fit_field
+from lapgs_wgpu.discovery.residual import Floats
 from lapgs_wgpu.discovery.rigid_fit import rigid_tracks
 from lapgs_wgpu.discovery.static_fit import static_fit
 from lapgs_wgpu.discovery.surface_points import surface_points
@@ -28,6 +29,7 @@ from lapgs_wgpu.train.start import Start
 DYNAMICS = 0.5  # standard deviation of the dynamics attribute of a discovered Gaussian, which it shares with its part
 SHEET_DYNAMICS = 2.0  # in place of it: of all sheets, and of the last one's time
 NEARLY_ALL = 0.8  # share of the surface points that tracks explain, above which the field has little left to learn
+ALL_TURN = 0.1  # of the field's highest rates, where all that moves turns: it forgets turns sooner than places
 RAMP_STEPS = 200  # over which learning rates rise after discovery, where schedule.warm_up is 0
 SHOWN = 2.0 / 255  # least difference from the background of an image that shows something
 
@@ -77,16 +79,16 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
     if share < config.discovery.least:
         tracks = None
     generator = torch.Generator().manual_seed(config.seed)
-    bodies = 0
+    light: dict[int, Floats] = {}  # on rigid bodies
     if tracks is not None and not sheets:
         stands, turns = find_turns(tracks, times, images)
         if turns:
-            tracks, bodies = rigid_tracks(tracks, stands, turns, times, images, device, generator)
+            tracks, light = rigid_tracks(tracks, stands, turns, times, images, device, generator)
     scene = scene_with(static, tracks, config, device, generator, own_field, sheets=sheets)
     found = f"{share:.1%} of what it lacks can be followed: nothing is added"
     if tracks is not None:
         meter = Progress(fit_steps, "steps of motion discovery, part 2 of 2: what moves")
-        error = fit_field(scene, tracks, times, len(static), fit_steps, generator, meter.at, fades=sheets)
+        error = fit_field(scene, tracks, times, len(static), fit_steps, generator, meter.at, fades=sheets, light=light)
         if error is None:
             tracks, scene = None, scene_with(static, None, config, device, generator, own_field)
             found = f"{share:.1%} of what it lacks can be followed, and the field moves nothing: nothing is added"
@@ -95,14 +97,16 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
             f"{len(np.unique(tracks.part))} moving parts with {len(tracks.part)} Gaussians, {share:.0%} of what it "
             f"lacks, followed within {error:.3f} world units"
         )
-        if bodies:
-            found += f", {bodies} of them as rigid bodies"
+        if light:
+            found += f", {len(light)} of them as rigid bodies"
     order = morton_order(scene.parameters["means"].detach())
     for name, values in scene.parameters.items():
         scene.parameters[name] = torch.nn.Parameter(values.detach()[order])
     meter.clear()
     summary = f"a static fit of {len(static)} Gaussians; {found}"
-    field_fitted = tracks is not None and share >= NEARLY_ALL
+    field_fitted = 0.0
+    if tracks is not None and share >= NEARLY_ALL:
+        field_fitted = ALL_TURN if len(light) == len(np.unique(tracks.part)) else 1.0
     return Start(
         scene,
         ramp_steps=config.schedule.warm_up or RAMP_STEPS,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import torch
@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from torch import Tensor, nn
 
+from lapgs_wgpu.discovery.residual import Floats
 from lapgs_wgpu.discovery.tracks import Tracks
 from lapgs_wgpu.motion.fields.config import APPEARANCE_SCALE
 from lapgs_wgpu.motion.fields.deformation import Deformation, TimeSamples
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.splat.constants import CONSTANTS
 from lapgs_wgpu.train.optimizer import ADAM_EPS
 
 AT_ONCE, FEWER = 8, 2  # for tracks that fade: times that a step looks at, and how many times fewer of them it asks
@@ -28,6 +30,8 @@ SHEET_STIFF = 10.0  # times as much, of the scales of tracks that fade
 FADED, FADE_WEIGHT = 7.0, 0.03  # logits by which what is not seen loses opacity; weight of the distance from that
 HINGES = 3.0  # of the decoder's units, whose inputs are of the size 1: how much they change over the clip
 OPEN = 2.0  # the gate's inputs: 0.76 is let through
+WITHIN, BEYOND = 0.5, 0.3  # of the way to another point of its body, on which a step asks for one; and away from it
+LIGHT_WEIGHT = 0.03  # of the light on bodies
 SOFTENING = 1e-2  # world units; distances below count as squares
 
 
@@ -41,17 +45,19 @@ def fit_field(
     progress: Callable[[int], None],
     *,
     fades: bool = False,
+    light: Mapping[int, Floats] | None = None,
 ) -> float | None:
     """Train the field of a scene so that its last Gaussians follow the tracks, and the first `still` ones stay.
 
-    Each step looks at one of the times (T,). fades: whether tracks lose opacity where they are not seen. Returns the
-    mean distance of tracks and Gaussians in the end, world units; None, and nothing is trained, where the field moves
-    no Gaussians.
+    Each step looks at one of the times (T,). fades: whether tracks lose opacity where they are not seen. light: (T, m)
+    of `rigid_tracks`, by the number of each part that is a body; of these the field learns all that lies inside, where
+    Gaussians will be, and the light. Returns the mean distance of tracks and Gaussians in the end, world units; None,
+    and nothing is trained, where the field moves no Gaussians.
     """
     field = scene.field
     assert field is not None
     groups = [(HASH_RATE if name == "hash" else MLP_RATE, each) for name, each in field.parameter_groups().items()]
-    if fades and (head := getattr(field, "appearance", None)) is not None:  # whose outputs count in that unit
+    if (fades or light) and (head := getattr(field, "appearance", None)) is not None:  # outputs in that unit
         own = {id(parameter) for parameter in head.parameters()}
         groups = [(rate, [each for each in parameters if id(each) not in own]) for rate, parameters in groups]
         groups.append((MLP_RATE / APPEARANCE_SCALE, list(head.parameters())))
@@ -64,6 +70,15 @@ def fit_field(
     paths, supported = torch.from_numpy(tracks.paths).to(device), torch.from_numpy(tracks.supported).to(device)
     beside = torch.from_numpy(ndimage.maximum_filter1d(tracks.supported, 3, axis=0)).to(device)
     moving = torch.arange(still, still + len(tracks.part), device=device)
+    canonical = scene.parameters["means"].detach()
+    first = torch.arange(len(tracks.part), device=device)  # of the points of its body, for each
+    count = torch.ones_like(first)
+    shades = torch.zeros(*tracks.paths.shape[:2], 3, device=device)
+    for k, factors in (light or {}).items():
+        body = np.flatnonzero(tracks.part == k)
+        first[body], count[body] = int(body[0]), len(body)
+        colors = CONSTANTS["SH_OFFSET"] / CONSTANTS["SH_C0"] + scene.parameters["sh_dc"].detach()[still + body, 0]
+        shades[:, body] = (torch.from_numpy(factors).to(device)[..., None] - 1) * colors
     order: list[int] = []
     errors: list[float] = []
     at_once, most = (AT_ONCE, MOVING // FEWER) if fades else (1, MOVING)
@@ -78,13 +93,19 @@ def fit_field(
             asked = moving[torch.randint(len(moving), (most,), generator=generator).to(device)]
         on_track = asked - still
         rows = torch.cat([asked, staying])
-        means = scene.parameters["means"].detach()[rows]
+        other, way = on_track, torch.zeros(len(asked), 1, device=device)
+        if light:
+            drawn = torch.rand(2, len(asked), 1, generator=generator).to(device)
+            other = first[on_track] + (drawn[0, :, 0] * count[on_track]).long()
+            way = drawn[1] * (WITHIN + BEYOND) - BEYOND
+        means = torch.cat([canonical[asked].lerp(canonical[still + other], way), canonical[staying]])
         dynamics = scene.parameters["dynamics"].detach()[rows] if "dynamics" in scene.parameters else None
         loss, distance = torch.zeros((), device=device), 0.0
         for at, move in zip(now, _moves(field, means, [float(times[at]) for at in now], dynamics), strict=True):
             moved = move.apply_to_means(means)
             seen = supported[at, on_track]
-            squared = (moved - torch.cat([paths[at, on_track], means[len(asked) :]])).square().sum(dim=1)
+            targets = paths[at, on_track].lerp(paths[at, other], way)
+            squared = (moved - torch.cat([targets, means[len(asked) :]])).square().sum(dim=1)
             far = (squared + SOFTENING**2).sqrt()
             if fades:  # few are seen at a time; between two times, those of both
                 weights = HIDDEN + (1 - HIDDEN) * beside[at, on_track].float()
@@ -98,6 +119,10 @@ def fit_field(
                 for weight, change in ((stiff, move.d_scales), (1.0, move.d_quats))
                 if change is not None
             )
+            if light and move.d_dc is not None:
+                shade = shades[at, on_track].lerp(shades[at, other], way)
+                of_tracks, of_still = move.d_dc.split([len(asked), len(staying)])
+                loss = loss + LIGHT_WEIGHT * ((of_tracks - shade).abs().mean() + of_still.abs().mean())
             if fades and move.d_opacity is not None:
                 fading = (move.d_opacity + FADED * torch.cat([~seen, seen.new_zeros(len(staying))])).abs()
                 of_tracks, of_still = fading.split([len(asked), len(staying)])

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from lapgs_wgpu.discovery.residual import Residual
 from lapgs_wgpu.discovery.tracks import Tracks, parabolas
@@ -39,8 +39,9 @@ def rigid_tracks(
     images: Sequence[Residual],
     device: Device,
     generator: torch.Generator,
-) -> tuple[Tracks, int]:
-    """The tracks, in which the parts of the given rotations (T, 3, 3) at the times (T,) are rigid bodies, and how many.
+) -> tuple[Tracks, dict[int, NDArray[np.float32]]]:
+    """The tracks, in which the parts of the given rotations (T, 3, 3) at the times (T,) are rigid bodies; and by the
+    number of each body the light (T, POINTS) on it, times its mean over time, which is in the colors.
 
     stands: (p,) which part stands for each; a body takes the place of all for which its part stands.
     Other parts are drawn, too, as they are, and so stay those of which too little of the images is explained.
@@ -86,7 +87,7 @@ def rigid_tracks(
             group["lr"] = 0.0 if moves and step < SHAPE_FIRST else rate
         R, center = poses(at)
         arms = values["points"] @ R.transpose(1, 2)
-        x, y, z = torch.nn.functional.normalize(arms.detach(), dim=2).unbind(dim=2)
+        x, y, z = nn.functional.normalize(arms.detach(), dim=2).unbind(dim=2)
         lit = (torch.stack(harmonics(x, y, z), dim=2) @ values["light"][:, :, None]).reshape(-1, 1)
         means = torch.cat([(arms + center[:, None]).reshape(-1, 3), soft_paths[at]])
         drawn = rasterize(
@@ -112,10 +113,14 @@ def rigid_tracks(
     rigid = errors[1] < UNEXPLAINED * errors[0]
     with torch.no_grad():
         R, center = poses(slice(None))
-        paths = (values["points"] @ R.transpose(2, 3) + center[:, :, None]).numpy()
-        colors = values["colors"][:count].clamp(0, 1).reshape(len(parts), POINTS, 3).numpy()
-    bodies = [_Body(k, paths[:, n], colors[n]) for n, k in enumerate(parts) if rigid[n]]
-    return _with_bodies(tracks, stands, bodies), len(bodies)
+        paths = values["points"] @ R.transpose(2, 3) + center[:, :, None]
+        arms = nn.functional.normalize(paths - center[:, :, None], dim=3)
+        light = (torch.stack(harmonics(*arms.unbind(dim=3)), dim=3) @ values["light"][:, :, None])[..., 0]
+        mean = light.mean(dim=0)
+        colors = (values["colors"][:count].reshape(len(parts), POINTS, 3) * mean[..., None]).clamp(0, 1).numpy()
+        light = (light / mean).numpy()
+    bodies = [_Body(k, paths[:, n].numpy(), colors[n]) for n, k in enumerate(parts) if rigid[n]]
+    return _with_bodies(tracks, stands, bodies), {k: light[:, n] for n, k in enumerate(parts) if rigid[n]}
 
 
 class _Body(NamedTuple):

@@ -75,7 +75,7 @@ class ExchangeStep:
     def _compared(self, scheduled: Scheduled, t: float) -> tuple[Nearby | None, TimeSamples | None]:
         """Draw what the losses of motion compare at a time of the field, None for each that is off."""
         config, count, generator = self._config, len(self._scene), self._draws.generator
-        near, even = compared_counts(config, scheduled, count, self._time_count, fitted=self._learners.field_fitted)
+        near, even = compared_counts(config, scheduled, count, self._time_count, fitted=self._learners.field_fitted > 0)
         nearby = draw_nearby(config.smoothness, near, count, t, generator) if near else None
         if not even or self._scene.field is None:
             return nearby, None

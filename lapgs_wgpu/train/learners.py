@@ -67,14 +67,14 @@ class Learners:
         return self._exposures
 
     @property
-    def field_fitted(self) -> bool:
-        """Whether discovery has fitted the field to nearly all that moves: its learning rates are then held low."""
+    def field_fitted(self) -> float:
+        """Not 0 where discovery has fitted the field to nearly all that moves: its rates are then held low (`Start`)."""
         return self._field_fitted
 
     @field_fitted.setter
-    def field_fitted(self, fitted: bool) -> None:
+    def field_fitted(self, fitted: float) -> None:
         self._field_fitted = fitted
-        self.optimizer.highest = max_field_rates(self._groups) if fitted else {}
+        self.optimizer.highest = max_field_rates(self._groups, fitted) if fitted else {}
 
     def camera(self, view: View) -> Camera:
         """The camera of a training view, corrected where it is."""

@@ -166,7 +166,7 @@ class ResidentStep:
         return task
 
     def _draw(self, task: Task, generator: torch.Generator) -> None:
-        config, count, fitted = self._config, len(self._scene), self._learners.field_fitted
+        config, count, fitted = self._config, len(self._scene), self._learners.field_fitted > 0
         near, even = compared_counts(config, task.scheduled, count, self._time_count, fitted=fitted)
         if near:
             task.near = Samples(near, count, *_draw_rows(count, generator), config.smoothness.reach)

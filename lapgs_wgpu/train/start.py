@@ -30,15 +30,15 @@ class Start:
     """What a training starts with: the first Gaussians, and the field.
 
     warm_up_steps: number of the first steps without motion. ramp_steps: of those over which the learning rates rise
-    from 0. field_fitted: whether the field knows nearly all that moves: its rates then stay low (`max_field_rates`),
-    and the acceleration loss is left out. corrections: of the training cameras; None where they are as given. summary:
+    from 0. field_fitted: 0, or the field knows nearly all that moves: its rates then stay below this share of the
+    highest (`max_field_rates`), and the acceleration loss is left out. corrections: of the training cameras; None where they are as given. summary:
     what discovery found, a sentence; None without discovery. seconds: that discovery took.
     """
 
     scene: Scene4D
     warm_up_steps: int = 0
     ramp_steps: int = 0
-    field_fitted: bool = False
+    field_fitted: float = 0.0
     corrections: Corrections | None = None
     summary: str | None = None
     seconds: float = 0.0
@@ -83,6 +83,6 @@ def initial_points(
     return points[order], colors[order], scales[order]
 
 
-def max_field_rates(groups: Iterable[str]) -> dict[str, float]:
-    """The highest learning rate of each group of a field's parameters at which it keeps what discovery fitted."""
-    return {name: MAX_HASH_RATE if name == "hash" else MAX_MLP_RATE for name in groups}
+def max_field_rates(groups: Iterable[str], share: float = 1.0) -> dict[str, float]:
+    """A share of the highest rate of each group of a field's parameters at which it keeps what discovery fitted."""
+    return {name: share * (MAX_HASH_RATE if name == "hash" else MAX_MLP_RATE) for name in groups}

@@ -271,7 +271,7 @@ class Trainer:
                 "done": torch.tensor(self.done),
                 "warm_up": torch.tensor(self.warm_up_steps),
                 "rising": torch.tensor(self._ramp_steps),
-                "field_fitted": torch.tensor(int(self._learners.field_fitted)),
+                "field_fitted": torch.tensor(self._learners.field_fitted, dtype=torch.float64),
                 "sh_degree": torch.tensor(scene.sh_degree),
                 "random": self._generator.get_state(),
                 "order": torch.tensor(self._draws.left, dtype=torch.int64),
@@ -307,7 +307,7 @@ class Trainer:
         own = parts["training"]
         self.done, scene.sh_degree = int(own["done"]), int(own["sh_degree"])
         self.warm_up_steps, self._ramp_steps = int(own["warm_up"]), int(own["rising"])
-        self._learners.field_fitted = bool(own["field_fitted"])
+        self._learners.field_fitted = float(own["field_fitted"])
         self._generator.set_state(own["random"])
         self._draws.left = own["order"].tolist()
         self._plans.set_bands(self._drawn, int(own["bands"]))
