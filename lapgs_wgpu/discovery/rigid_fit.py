@@ -16,19 +16,19 @@ from torch import Tensor, nn
 
 from lapgs_wgpu.discovery.residual import Residual
 from lapgs_wgpu.discovery.tracks import Tracks, parabolas
-from lapgs_wgpu.discovery.turns import SPREAD, harmonics, part_radius
+from lapgs_wgpu.discovery.turns import harmonics, part_radius
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.rasterize import rasterize
 
 POINTS = 300  # of a body
 SPACING = 0.5  # standard deviation of a Gaussian in distances of a body's points, at first
-OPACITY = 1.5  # logit, at first
+OPACITY = 3.0  # logit, at first
 STEPS = 800
 SHAPE_FIRST = 60  # steps before bodies are turned and shifted
 RATES = {"points": 2e-3, "colors": 2e-2, "sizes": 1e-2, "opacities": 3e-2, "light": 5e-3, "turns": 1e-2, "shifts": 1e-3}
 LAST = 0.05  # of these rates, in the end; they fall over the second half
 UNEXPLAINED = 0.3  # of what the static fit lacks where a body is: more is left over of what is not rigid
-SPREADS = {"turns": SPREAD, "shifts": 2.0}  # time steps; of the weights by which parabolas are fitted around each time
+SPREADS = {"turns": 4.0, "shifts": 2.0}  # time steps; of the weights by which parabolas are fitted around each time
 
 
 def rigid_tracks(
