@@ -275,8 +275,8 @@ def test_a_part_that_turns_becomes_a_rigid_body(device: Device, monkeypatch: pyt
     stands, found = find_turns(tracks, times, images)
     assert degrees_beside(found[0], true).mean() < 15
     generator = torch.Generator().manual_seed(0)
-    rigid, bodies = rigid_fit.rigid_tracks(tracks, stands, found, times, images, device, generator)
-    assert bodies == 1
+    rigid, light = rigid_fit.rigid_tracks(tracks, stands, found, times, images, device, generator)
+    assert light[0].mean(axis=0) == pytest.approx(np.ones(rigid_fit.POINTS), abs=1e-4)
     arms = rigid.paths - rigid.paths.mean(axis=1, keepdims=True)
     left, _, right = np.linalg.svd(np.einsum("tni,nj->tij", arms, arms[20]))
     assert np.quantile(degrees_beside(left @ right, true), 0.9) < 6
@@ -373,16 +373,16 @@ def test_the_static_fit_has_no_motion_and_small_images(dataset: Dataset) -> None
     "kind", ["laplacian", *(pytest.param(kind, marks=pytest.mark.nightly) for kind in ("grid4d", "hexplane", "mlp"))]
 )
 def test_every_field_learns_tracks(device: Device, kind: str) -> None:
-    center = path(np.linspace(0, 1, 20)) * 0.5
     config = load_config("tiny", {k: v for k, v in QUICK.items() if k.startswith("field.")}, method=kind).field
-    tracks = tracks_along(center)
-    scene = Scene4D.from_points(
-        tracks.positions, np.full((20, 3), 0.5), np.full(20, 0.05), config, device=device, seed=1
-    )
+    tracks = tracks_along(path(np.linspace(0, 1, 20)) * 0.5)
+    scene = Scene4D.from_points(tracks.positions, tracks.colors, np.full(20, 0.05), config, device=device, seed=1)
     at_rest = np.linalg.norm(tracks.paths - tracks.positions, axis=2).mean()
     times, generator = np.linspace(0, 1, 20), torch.Generator().manual_seed(0)
-    error = fit_field(scene, tracks, times, 0, 250, generator, lambda step: None)
+    light = np.linspace(0.5, 1.5, 20, dtype=np.float32)[:, None].repeat(20, axis=1)
+    error = fit_field(scene, tracks, times, 0, 250, generator, lambda step: None, light={0: light})
     assert error < {"laplacian": 0.35, "grid4d": 0.35, "hexplane": 0.65, "mlp": 0.65}[kind] * at_rest
+    brighter = float((scene.at(1.0).sh - scene.at(0.0).sh).detach()[:, 0].mean())
+    assert (brighter > 1e-3) == (kind == "laplacian")  # the only one whose colors change
 
 
 @pytest.fixture(scope="module")
@@ -457,8 +457,8 @@ def test_a_field_that_knows_the_tracks_learns_slowly_also_when_resumed(
     assert config.rates.mlp.start > max_field_rates(["mlp"])["mlp"]
     with Trainer(config, dataset, device) as resumed:
         assert resumed._learners.optimizer.highest == {}
-        resumed.restore(started[1])
-        assert resumed._learners.optimizer.highest == max_field_rates(["hash", "mlp"])
+        resumed.restore(started[1] | {"training.field_fitted": np.array(0.1)})
+        assert resumed._learners.optimizer.highest == max_field_rates(["hash", "mlp"], 0.1)
 
 
 @pytest.mark.nightly

@@ -7,14 +7,13 @@ Gaussians, the light, and smooth corrections of its turn and shift at all times.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from lapgs_wgpu.discovery.residual import Residual
+from lapgs_wgpu.discovery.residual import Floats, Residual
 from lapgs_wgpu.discovery.tracks import Tracks, parabolas
 from lapgs_wgpu.discovery.turns import harmonics, part_radius
 from lapgs_wgpu.gpu.device import Device
@@ -24,7 +23,6 @@ POINTS = 300  # of a body
 SPACING = 0.5  # standard deviation of a Gaussian in distances of a body's points, at first
 OPACITY = 3.0  # logit, at first
 STEPS = 800
-SHAPE_FIRST = 60  # steps before bodies are turned and shifted
 RATES = {"points": 2e-3, "colors": 2e-2, "sizes": 1e-2, "opacities": 3e-2, "light": 5e-3, "turns": 1e-2, "shifts": 1e-3}
 LAST = 0.05  # of these rates, in the end; they fall over the second half
 UNEXPLAINED = 0.3  # of what the static fit lacks where a body is: more is left over of what is not rigid
@@ -39,7 +37,7 @@ def rigid_tracks(
     images: Sequence[Residual],
     device: Device,
     generator: torch.Generator,
-) -> tuple[Tracks, dict[int, NDArray[np.float32]]]:
+) -> tuple[Tracks, dict[int, Floats]]:
     """The tracks, in which the parts of the given rotations (T, 3, 3) at the times (T,) are rigid bodies; and by the
     number of each body the light (T, POINTS) on it, times its mean over time, which is in the colors.
 
@@ -73,7 +71,8 @@ def rigid_tracks(
 
     def poses(at: int | slice) -> tuple[Tensor, Tensor]:
         turns, shifts = (torch.tensordot(around[name][at], values[name], 1) for name in ("turns", "shifts"))
-        return torch.linalg.matrix_exp(_cross(turns)) @ R0[at], centers[at] + shifts
+        turned = torch.linalg.cross(torch.eye(3).expand(*turns.shape, 3), turns[..., None, :])
+        return torch.linalg.matrix_exp(turned) @ R0[at], centers[at] + shifts
 
     order: list[int] = []
     errors = np.zeros((2, len(parts)))  # of the static fit and of the drawing, where a part is, at the end
@@ -82,9 +81,7 @@ def rigid_tracks(
         image = images[order.pop()]
         at = int(np.searchsorted(times, image.time))
         for group in optimizer.param_groups:
-            moves = group["name"] in ("turns", "shifts")
-            rate = RATES[group["name"]] * max(LAST, min(1.0, 2.0 * (STEPS - step) / STEPS))
-            group["lr"] = 0.0 if moves and step < SHAPE_FIRST else rate
+            group["lr"] = RATES[group["name"]] * max(LAST, min(1.0, 2.0 * (STEPS - step) / STEPS))
         R, center = poses(at)
         arms = values["points"] @ R.transpose(1, 2)
         x, y, z = nn.functional.normalize(arms.detach(), dim=2).unbind(dim=2)
@@ -119,34 +116,27 @@ def rigid_tracks(
         mean = light.mean(dim=0)
         colors = (values["colors"][:count].reshape(len(parts), POINTS, 3) * mean[..., None]).clamp(0, 1).numpy()
         light = (light / mean).numpy()
-    bodies = [_Body(k, paths[:, n].numpy(), colors[n]) for n, k in enumerate(parts) if rigid[n]]
+    bodies = {k: (paths[:, n].numpy(), colors[n]) for n, k in enumerate(parts) if rigid[n]}
     return _with_bodies(tracks, stands, bodies), {k: light[:, n] for n, k in enumerate(parts) if rigid[n]}
 
 
-class _Body(NamedTuple):
-    """part: whose place it takes. paths: (T, POINTS, 3). colors: (POINTS, 3)."""
-
-    part: int
-    paths: NDArray[np.float32]
-    colors: NDArray[np.float32]
-
-
-def _with_bodies(tracks: Tracks, stands: NDArray[np.int64], bodies: list[_Body]) -> Tracks:
-    """The tracks, with bodies in place of parts; their positions are those at the times where the parts were found."""
-    others = ~np.isin(stands[tracks.part], [body.part for body in bodies])
+def _with_bodies(tracks: Tracks, stands: NDArray[np.int64], bodies: Mapping[int, tuple[Floats, Floats]]) -> Tracks:
+    """The tracks, with bodies in place of parts, by these their paths (T, POINTS, 3) and colors (POINTS, 3); their
+    positions are those at the times where the parts were found."""
+    others = ~np.isin(stands[tracks.part], list(bodies))
     over_time = tracks.paths[:, others], tracks.supported[:, others]
     parts = [(tracks.positions[others], tracks.colors[others], tracks.part[others], *over_time)]
-    for body in bodies:
-        members = tracks.part == body.part
+    for k, (paths, colors) in bodies.items():
+        members = tracks.part == k
         away = np.linalg.norm(tracks.paths[:, members].mean(axis=1) - tracks.positions[members].mean(axis=0), axis=1)
         seen = np.repeat(tracks.supported[:, members][:, :1], POINTS, axis=1)
-        parts.append((body.paths[int(away.argmin())], body.colors, np.full(POINTS, body.part), body.paths, seen))
+        parts.append((paths[int(away.argmin())], colors, np.full(POINTS, k), paths, seen))
     every = list(zip(*parts, strict=True))
     positions, colors, part = (np.concatenate(values) for values in every[:3])
     return Tracks(positions, colors, part, *(np.concatenate(values, axis=1) for values in every[3:]))
 
 
-def _shown(image: Residual, centers: NDArray[np.float32], radii: NDArray[np.float32]) -> list[NDArray[np.bool_]]:
+def _shown(image: Residual, centers: Floats, radii: Floats) -> list[NDArray[np.bool_]]:
     """For each ball (n, 3) of these radii (n,) the moving pixels (H, W) within its outline."""
     middles, depths = image.camera.project(centers.astype(np.float64))
     rows, columns = np.indices(image.mask.shape) + 0.5
@@ -162,10 +152,3 @@ def _sphere(count: int) -> Tensor:
     angle = np.pi * (1 + 5**0.5) * np.arange(count)
     wide = np.sqrt(1 - height**2)
     return torch.from_numpy(np.stack([wide * np.cos(angle), wide * np.sin(angle), height], axis=1)).float()
-
-
-def _cross(vectors: Tensor) -> Tensor:
-    """(..., 3, 3) matrices of the cross product with vectors (..., 3)."""
-    x, y, z = vectors.unbind(dim=-1)
-    zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
