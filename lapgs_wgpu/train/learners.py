@@ -68,7 +68,7 @@ class Learners:
 
     @property
     def field_fitted(self) -> float:
-        """Not 0 where discovery has fitted the field to nearly all that moves: its rates are then held low (`Start`)."""
+        """Not 0 where discovery fitted the field to nearly all that moves: its rates are then held low (`Start`)."""
         return self._field_fitted
 
     @field_fitted.setter
