@@ -115,9 +115,9 @@ def rigid_tracks(
         light = (torch.stack(harmonics(*arms.unbind(dim=3)), dim=3) @ values["light"][:, :, None])[..., 0]
         mean = light.mean(dim=0)
         colors = (values["colors"][:count].reshape(len(parts), POINTS, 3) * mean[..., None]).clamp(0, 1).numpy()
-        light = (light / mean).numpy()
+        lights = (light / mean).numpy()
     bodies = {k: (paths[:, n].numpy(), colors[n]) for n, k in enumerate(parts) if rigid[n]}
-    return _with_bodies(tracks, stands, bodies), {k: light[:, n] for n, k in enumerate(parts) if rigid[n]}
+    return _with_bodies(tracks, stands, bodies), {k: lights[:, n] for n, k in enumerate(parts) if rigid[n]}
 
 
 def _with_bodies(tracks: Tracks, stands: NDArray[np.int64], bodies: Mapping[int, tuple[Floats, Floats]]) -> Tracks:
