@@ -151,7 +151,9 @@ class Rasterizer:
         limit = min(self.max_capacity, _BAND_CAPACITY) if bands < rows else self.max_capacity
         if most > limit:
             if bands >= rows:
-                raise DeviceMemoryError(f"one row of tiles holds {most} intersections, a binding {limit}")
+                raise DeviceMemoryError(
+                    f"one row of tiles holds {most} intersections, but the device's bindings hold {limit}"
+                )
             bands = min(rows, max(bands + 1, -(-5 * sum(totals) // (4 * limit))))
         self.plans.now = replace(plan, capacity=min(limit, roomy(most)), bands=bands)
         return True
