@@ -52,7 +52,6 @@ FILES = {
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of all captures."""
     return tmp_path_factory.mktemp("captures")
 
 

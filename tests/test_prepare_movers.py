@@ -175,13 +175,11 @@ def test_matches_without_masked_features() -> None:
 
 def test_cameras_that_follow_what_moves_in_a_part_of_the_film() -> None:
     """In the first image they fit its left quarter alone, in the second all but that: both see it move."""
-    moves, names = np.zeros((9, 12), bool), ["a", "b"]
-    moves[:, :3] = True
+    moves = np.tile(np.arange(12) < 3, (9, 1))
     errors = [np.where(moves, 1.0, 8.0).astype(np.float32), np.where(moves, 20.0, 1.0).astype(np.float32)]
     wrong = Judged(errors, [np.log(each) for each in errors], float(np.log(5)), 0.3)
     right = wrong._replace(errors=errors[1:] * 2)
-    assert wrong.contradicted(names) == ["a"]
-    assert right.contradicted(names) == []
-    assert right.explained(wrong) == pytest.approx(1.5) == 1 / wrong.explained(right)
-    shares = [mask.mean() for mask in wrong.turned_over(names).values()]
-    assert shares == [pytest.approx(1 / 3)] * 2  # one place wider than a quarter
+    assert (wrong.contradicted(["a", "b"]), right.contradicted(["a", "b"])) == (["a"], [])
+    assert right.explained(wrong) == pytest.approx(1.5)
+    wider = [mask.mean() for mask in wrong.turned_over(["a", "b"]).values()]
+    assert wider == [pytest.approx(1 / 3)] * 2

@@ -102,7 +102,6 @@ def test_backward_twice(device: Device, scene: Scene) -> None:
 
 @pytest.fixture(scope="module")
 def total(device: Device, expected: Step) -> int:
-    """Intersections of the scene."""
     return needed(rasterizer_of(device))
 
 

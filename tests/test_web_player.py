@@ -80,7 +80,6 @@ def window(chromium: Browser) -> Browser:
 
 @pytest.fixture
 def browser(window: Browser, page: Path) -> Browser:
-    """With the page as it opens."""
     if not window.value("location.href").startswith(page.as_uri() + "#") or not shown(window):
         open_page(window, page.as_uri() + "#")
     window.key("r")

@@ -117,7 +117,6 @@ class Browser:
         self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, buttons=int(down), **pressed)
 
     def key(self, key: str) -> None:
-        """Press and release."""
         self.call("Input.dispatchKeyEvent", type="keyDown", key=key, text=key if len(key) == 1 else "")
         self.call("Input.dispatchKeyEvent", type="keyUp", key=key)
 

@@ -32,7 +32,6 @@ def disturbed(cameras: Sequence[Camera], degrees: float, percent: float, seed: i
 
 
 def extent_of(cameras: Sequence[Camera]) -> float:
-    """As `Dataset.extent`."""
     places = np.stack([camera.position for camera in cameras])
     return 1.1 * float(np.linalg.norm(places - places.mean(axis=0), axis=1).max())
 

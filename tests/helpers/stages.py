@@ -37,7 +37,6 @@ def capture(monkeypatch: pytest.MonkeyPatch, pass_name: str, *names: str) -> Cop
 
 
 def all_of(array: DeviceArray) -> NDArray[Any]:
-    """All elements of an array."""
     return array.read().reshape(-1)
 
 

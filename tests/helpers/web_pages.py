@@ -95,7 +95,6 @@ class Desktop:
 
 
 def psnr(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
-    """dB, of colors in [0, 1]."""
     assert a.shape == b.shape
     return float(-10 * np.log10(max(np.mean((a.astype(np.float64) - b) ** 2), 1e-30)))
 
