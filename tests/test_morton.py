@@ -27,12 +27,6 @@ def test_an_order_that_repeats(count: int) -> None:
     assert morton_order(points[order]).tolist() == list(range(count))
 
 
-def test_points_at_one_place_stay_in_their_order() -> None:
-    assert morton_order(torch.ones(7, 3)).tolist() == list(range(7))
-    flat = torch.tensor([[3.0, 0, 5], [1, 0, 5], [2, 0, 5], [1, 0, 5]])
-    assert morton_order(flat).tolist() == [1, 3, 2, 0]
-
-
 def test_neighbours_come_near_one_another() -> None:
     points = torch.rand(4096, 3, generator=torch.Generator().manual_seed(2))
     steps = points[morton_order(points)].diff(dim=0).norm(dim=1)
