@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import signal
 import subprocess
 import sys
@@ -214,7 +215,8 @@ def test_a_run_that_ends_with_steps_in_flight_goes_on_to_the_same_bytes(
     train(config, dataset, tmp_path / "whole", device=device)
     if how == "killed":  # another process, whose driver dies with it
         call = f"import test_resident_step as t; t.ends(t.Path({str(data)!r}), t.Path({str(out)!r}), {configuration!r})"
-        ended = subprocess.run([sys.executable, "-c", call], cwd=Path(__file__).parent, check=False)
+        paths = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+        ended = subprocess.run([sys.executable, "-c", call], cwd=Path(__file__).parent, env=paths, check=False)
         assert ended.returncode == -signal.SIGKILL
     else:
         with pytest.raises((KeyboardInterrupt, DeviceLostError, DeviceMemoryError)) as raised:
