@@ -15,20 +15,20 @@ from lapgs_wgpu.data.views import composite
 from lapgs_wgpu.gpu.device import open_device
 from lapgs_wgpu.motion.playback.playback import DevicePlayback, playback_of
 from lapgs_wgpu.motion.scene_file import compact_bytes, read_scene
+from lapgs_wgpu.viewer.capture_views import capture_views
 from lapgs_wgpu.viewer.loaded_scene import load_scene
 from lapgs_wgpu.viewer.offscreen import OffscreenRenderer
-from lapgs_wgpu.viewer.view_state import ViewState
 
 
 def mean_psnr(path: Path, run: Path) -> float:
     """PSNR of the scene in a file on the test views of a run's capture, dB."""
     scene = load_scene(path, open_device)
-    capture = ViewState(load_scene(run / "checkpoint.ply", open_device)).ground_truth
-    if capture is None:
+    views = [view for view in capture_views(load_scene(run / "checkpoint.ply", open_device)) if "test" in view.name]
+    if not views:
         raise SystemExit(f"{run}: its capture is not here")
     draw = OffscreenRenderer(scene)
     values = []
-    for view in [view for view in capture.views if view.name.startswith("test")]:
+    for view in views:
         truth = composite(view.load(), np.asarray(scene.background, np.float32))
         error = np.float64(draw(view.camera, view.time)) - truth
         values.append(20 * np.log10(255) - 10 * np.log10(np.mean(error**2)))

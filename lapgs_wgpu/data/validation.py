@@ -93,15 +93,16 @@ def check_plausible(frames: Sequence[Frame]) -> list[str]:
 def _black_cameras(frames: Sequence[Frame]) -> list[str]:
     by_camera = dict[str, list[ImageFile]]()
     for frame in frames:
-        if frame.name.camera and isinstance(frame.image, ImageFile):
+        if frame.name.camera and isinstance(frame.image, ImageFile) and not frame.image.deep:
             by_camera.setdefault(frame.name.camera, []).append(frame.image)
     several = {name: evenly(images, BLACK_AT) for name, images in by_camera.items() if len(images) > 1}
     black = [name for name, images in several.items() if all(decode(i.path)[..., :3].max() < BLACK for i in images)]
     if not black:
         return []
+    advice = "leave them out" if len(several) > 1 else "give brighter images"
     return [
         f"{len(black)} of {len(several)} cameras are black, such as {black[0]}: in {len(several[black[0]])} of its "
-        f"{len(by_camera[black[0]])} images, such as {several[black[0]][0]}, no level reaches {BLACK}: leave them out."
+        f"{len(by_camera[black[0]])} images, such as {several[black[0]][0]}, no level reaches {BLACK}: {advice}."
     ]
 
 
