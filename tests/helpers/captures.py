@@ -56,7 +56,6 @@ class Blobs(NamedTuple):
 
     @property
     def bytes_of_colors(self) -> np.ndarray:
-        """(N, 3) uint8."""
         return (self.colors * 255).round().byte().numpy()
 
 
