@@ -28,7 +28,6 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict:
         "forward + backward",
         "0 of them before the sort",
         "times as fast as the reference;",
-        "times as fast on the device;",
         "as fast as the references",
         "at the ceiling",
     ):
