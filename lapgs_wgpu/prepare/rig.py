@@ -61,7 +61,8 @@ def place_still(films: Sequence[Film], images: Path, fps: float, work: Path) -> 
     cameras = extract_in_step(films, images, fps, shapes)
     times = [[picture.name for picture in each] for each in common_times(cameras, TIMES)]
     if not times:
-        raise InputError("the films have no time in common; cut them to begin at one moment.")
+        most = max(map(len, cameras))
+        raise InputError(f"of {most} times, all {len(films)} films have none in common; cut them to begin together.")
     groups = list(zip(*times, strict=True))  # of each camera
     names = [name for group in groups for name in group]
     source = Reconstruction(images, names, work, LENS, "SINGLE" if len(set(covering)) == 1 else "PER_FOLDER")
