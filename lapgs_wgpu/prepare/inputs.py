@@ -135,7 +135,9 @@ def _unpacked(path: Path, folder: Path) -> Path:
             entries = [entry for entry in file.infolist() if _is(Path(entry.filename), IMAGE_SUFFIXES + FILM_SUFFIXES)]
             size, free = sum(entry.file_size for entry in entries), shutil.disk_usage(folder).free
             if size > free:
-                raise InputError(f"{path} holds {size / 1e9:.1f} GB, and {folder} has {free / 1e9:.1f} GB left: free some.")
+                raise InputError(
+                    f"{path} holds {size / 1e9:.1f} GB, and {folder} has {free / 1e9:.1f} GB left: free some."
+                )
             for entry in entries:
                 file.extract(entry, folder)
     except (zipfile.BadZipFile, RuntimeError, NotImplementedError, OSError) as error:
