@@ -84,6 +84,8 @@ def test_a_sequence_and_back_to_usd(scene: LoadedScene, device: Device, tmp_path
 def test_frames_of_others_with_other_counts(device: Device, tmp_path: Path) -> None:
     for number, count in ((1, 5), (2, 8), (10, 3)):
         write_ply(tmp_path / f"f{number}.ply", random_still(count, seed=number))
+        if number == 1:  # a folder of one
+            assert load_scene(tmp_path, lambda: device).playback.count == 5
     scene = load_scene(tmp_path, lambda: device)
     assert (scene.playback.count, scene.clock().frames) == (8, 3)
     for t, count in ((0.0, 5), (0.5, 8), (1.0, 3)):

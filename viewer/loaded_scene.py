@@ -58,10 +58,14 @@ def load_scene(
 ) -> LoadedScene:
     """Open a checkpoint, a compact scene, any 3DGS .ply, or a moving file of others. Raises InputError.
 
+    path: file, or a folder: of frames, of a sequence, or of one .ply, which is opened.
     device: is asked for when the file has been read. up: axis of AHEAD that points up, antialiased: how the Gaussians
     are drawn; both otherwise as the file says.
     """
     playback: Playback
+    if path.is_dir() and not (path / moving_files.MANIFEST).is_file():
+        files = list(path.glob("*.ply"))
+        path = files[0] if len(files) == 1 else path
     moving, file = open_moving(path), None
     if moving is not None:
         playback, frames = moving_files.SampledPlayback(device(), moving, antialiased), moving.frames
