@@ -113,7 +113,7 @@ COLMAP: list[Case] = [
     (gone("images"), "images"),
     (gone("images/frame_0002.png", "images/frame_0003.png"), "frame_0002.png images.txt"),
     (gone(f"{MODEL}/points3D.txt"), "points3D.txt"),
-    (replaced(f"{MODEL}/cameras.txt", "PINHOLE", "OPENCV_FISHEYE"), "cameras.txt OPENCV_FISHEYE"),
+    (replaced(f"{MODEL}/cameras.txt", "PINHOLE", "EQUIRECTANGULAR"), "cameras.txt EQUIRECTANGULAR panoramas"),
     (word(f"{MODEL}/cameras.txt", 1, 4, "1e-9"), "cameras.txt"),
     (word(f"{MODEL}/cameras.txt", 1, 6, "nan"), "cx nan"),
     (word(f"{MODEL}/cameras.txt", 1, 3, "64"), "64x48 64x64 cameras.txt"),

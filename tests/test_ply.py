@@ -134,7 +134,7 @@ BAD: list[tuple[bytes, str]] = [
     (edit(b"end_header", b"element vertex 4\nend_header"), "element"),
     (edit(b"element vertex 4\n", b""), "line 3"),
     (edit(b"element vertex", b"element vortex"), "vertex"),
-    (edit(b"vertex 4", b"vertex -4"), "vertex -4"),
+    (ply_bytes({name: ("float", [0, 0]) for name in "xyz"}), "cloud of points"),
     (edit(b"vertex 4", b"vertex 1_0"), "vertex 1_0"),
     (edit(b"vertex 4", b"vertex " + b"9" * 5000), "count"),
     (edit(b"vertex 4", b"vertex 100000000"), "100000000"),
