@@ -246,7 +246,7 @@ def harmonics_4dgs(gaussians: Any) -> NDArray[np.floating]:
 def _finite(values: Floats, path: Path) -> Floats:
     bad = int((~np.isfinite(values).all(axis=1)).sum())
     if bad or not len(values):
-        raise InputError(f"{path}: {bad} of {len(values)} Gaussians hold NaN or infinity; all must be finite.")
+        raise InputError(f"{path}: {bad} of {len(values)} Gaussians hold NaN or infinity; export it again.")
     return values
 
 

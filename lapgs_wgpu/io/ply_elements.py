@@ -225,5 +225,5 @@ def _place(
             )
     file.seek(end)
     if not text and file.read(3) not in (b"", b"\n", b"\r\n"):  # some programs append a line's end
-        raise InputError(f"{path}: its header declares {end} bytes, and the file has {size}: a count in it is wrong.")
+        raise InputError(f"{path}: has {size} bytes, its header declares {end}: a count is wrong, or more was added.")
     return placed

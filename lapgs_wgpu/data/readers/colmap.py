@@ -48,7 +48,7 @@ def _read(folder: Path, image_size: int | None) -> Capture:
         cloud = Cloud(model.points, (model.colors / 255).astype(np.float32))
     else:
         warnings.append(
-            f"{model.points_file} holds 0 points, so Gaussians start at random depths; one with points trains better."
+            f"{model.points_file} holds 0 points, so Gaussians start at random depths; points make it train better."
         )
     return Capture(
         frames,
