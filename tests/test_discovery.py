@@ -187,7 +187,7 @@ def fast_path(t: np.ndarray) -> np.ndarray:
 def test_trajectories_follow_what_passes_its_own_radius_from_one_time_to_the_next() -> None:
     t = np.linspace(0, 1, 100)
     one, other = fast_path(t), np.stack([0.8 * np.cos(10 * np.pi * t), 0 * t, -0.7 + 0 * t], axis=1)
-    found = find_trajectories(balls(one, other), LINK, BOX)
+    found = find_trajectories(balls(one, other), LINK, BOX)[0]
     assert len(found) == 2
     for center in (one, other):
         apart = min((np.linalg.norm(each.centers - center, axis=1) for each in found), key=np.median)
@@ -197,7 +197,7 @@ def test_trajectories_follow_what_passes_its_own_radius_from_one_time_to_the_nex
 
 def test_a_trajectory_leaps_over_times_without_points() -> None:
     center = path(np.linspace(0, 1, 80))
-    (found,) = find_trajectories(balls(center, gone=range(50, 54)), LINK, BOX)
+    ((found,),) = find_trajectories(balls(center, gone=range(50, 54)), LINK, BOX)
     assert not found.seen[50:54].any()
     assert found.seen[:50].mean() > 0.9
     assert found.seen[54:].mean() > 0.9
@@ -207,7 +207,7 @@ def test_a_trajectory_leaps_over_times_without_points() -> None:
 def test_a_trajectory_does_not_change_over_to_another_color_at_a_crossing() -> None:
     t = np.linspace(-1, 1, 60)
     one, other = np.stack([0.9 * t, 0.25 + 0 * t, 0 * t], axis=1), np.stack([0 * t, 0.9 * t - 0.3, 0 * t], axis=1)
-    found = find_trajectories(balls(one, other), LINK, BOX)
+    found = find_trajectories(balls(one, other), LINK, BOX)[0]
     for center in (one, other):
         assert min(np.linalg.norm(each.centers - center, axis=1)[[0, 10, 50, 59]].max() for each in found) < RADIUS
 
@@ -219,7 +219,7 @@ def test_equal_things_that_meet_keep_their_own_trajectories() -> None:
     one, other = np.stack([swing, 0 * t, 0.23 + 0 * t], axis=1), np.stack([0 * t, swing, -0.23 + 0 * t], axis=1)
     clouds = balls(one, other)
     grey = tuple(cloud._replace(colors=0 * cloud.colors + 0.5) for cloud in clouds.clouds)
-    found = find_trajectories(PointClouds(clouds.times, grey), LINK, BOX)
+    found = find_trajectories(PointClouds(clouds.times, grey), LINK, BOX)[0]
     assert len(found) == 2
     for center in (one, other):
         assert min(np.linalg.norm(each.centers - center, axis=1).max() for each in found) < 1.5 * RADIUS

@@ -27,6 +27,7 @@ PROBES = 300  # points of a time by which parts are counted, at most
 # In half sides of the box, 1.3 in the presets:
 VOXEL = 0.045  # spacing of a track's points
 REACH = 0.07  # distance within which a track explains a point
+FOLLOWED = 0.5  # of all points, how close tracks come that are good enough
 CLOSE = 0.03  # standard deviation of the distance from a track, by which two sets of tracks are compared
 CALM = 0.02  # jitter of a part's center that is no leaping
 LEAST_SEEN = 0.4  # share of the times at which a part must be seen
@@ -69,11 +70,18 @@ def find_tracks(clouds: PointClouds, half_side: float) -> Tracks | None:
     points lie in, world units.
 
     Many parts are apart where things part, and also where one thing falls to patches. Which it is shows in how close
-    to all points the tracks come that start there.
+    to all points the tracks come that start there. Where that is far from all, trajectories that share groups may do
+    better.
     """
-    trajectories = find_trajectories(clouds, LINK * half_side, half_side)
-    found = [_tracks_by(many, clouds, trajectories, half_side) for many in MANY]
-    return max(found, key=lambda tracks: _closeness(clouds, tracks, half_side))
+    closest, best = -1.0, None
+    for trajectories in find_trajectories(clouds, LINK * half_side, half_side):
+        for many in MANY:
+            tracks = _tracks_by(many, clouds, trajectories, half_side)
+            if (close := _closeness(clouds, tracks, half_side)) > closest:
+                closest, best = close, tracks
+        if closest >= FOLLOWED * clouds.total:
+            break
+    return best
 
 
 def _closeness(clouds: PointClouds, tracks: Tracks | None, half_side: float) -> float:

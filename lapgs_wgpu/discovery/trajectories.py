@@ -12,6 +12,7 @@ they bend least.
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import combinations
 from typing import NamedTuple
 
@@ -62,8 +63,9 @@ class _Groups(NamedTuple):
     worth: NDArray[np.float64]
 
 
-def find_trajectories(clouds: PointClouds, link: float, half_side: float) -> list[Trajectory]:
-    """Trajectories of what the surface points show, those that explain most first.
+def find_trajectories(clouds: PointClouds, link: float, half_side: float) -> list[list[Trajectory]]:
+    """Trajectories of what the surface points show, those that explain most first: one to one, and then as they were
+    found, where that differs.
 
     link: distance of points of one group. half_side: of the box that they lie in. Both in world units.
     """
@@ -77,8 +79,8 @@ def find_trajectories(clouds: PointClouds, link: float, half_side: float) -> lis
         groups.worth[path] *= AGAIN
         paths.append(path)
     at_once = int(np.quantile(np.bincount(groups.time, minlength=len(clock)), AT_ONCE))
-    paths = _one_to_one(groups, paths[:at_once], clock, half_side) + paths[at_once:]
-    return [_smooth(groups, path, clock) for path in paths]
+    given = _one_to_one(groups, paths[:at_once], clock, half_side) + paths[at_once:]
+    return [[_smooth(groups, path, clock) for path in each] for each in ([given] if given == paths else [given, paths])]
 
 
 def _groups(clouds: PointClouds, clock: NDArray[np.float64], link: float) -> _Groups:
@@ -162,7 +164,7 @@ def _one_to_one(
 
 
 def _uncross(groups: _Groups, paths: list[list[int]], clock: NDArray[np.float64], half_side: float) -> None:
-    """Exchange the ends of two paths after they met, where both then bend less."""
+    """Exchange the ends of two paths after they met, where both then bend less and keep their colors."""
     for a, b in combinations(range(len(paths)), 2):
         apart = np.linalg.norm(
             _smooth(groups, paths[a], clock).centers - _smooth(groups, paths[b], clock).centers, axis=1
@@ -175,11 +177,12 @@ def _uncross(groups: _Groups, paths: list[list[int]], clock: NDArray[np.float64]
         for i in lowest:
             before = [[g for g in paths[n] if groups.time[g] <= i] for n in (a, b)]
             after = [[g for g in paths[n] if groups.time[g] > i] for n in (a, b)]
-            bends = [
-                sum(_bend(groups, one, other, clock[i]) for one, other in zip(before, ends, strict=True))
-                for ends in (after, after[::-1])
-            ]
-            if bends[1] < bends[0] and min(len(before[0] + after[1]), len(before[1] + after[0])) >= LEAST_WORTH:
+            bends, changes = (
+                [sum(of(one, other) for one, other in zip(before, ends, strict=True)) for ends in (after, after[::-1])]
+                for of in (partial(_bend, groups, moment=clock[i]), partial(_change, groups))
+            )
+            better = bends[1] < bends[0] and changes[1] < changes[0] + COLOR_SPREAD
+            if better and min(len(before[0] + after[1]), len(before[1] + after[0])) >= LEAST_WORTH:
                 paths[a], paths[b] = before[0] + after[1], before[1] + after[0]
 
 
@@ -191,6 +194,13 @@ def _bend(groups: _Groups, before: list[int], after: list[int], moment: float) -
     basis = np.vander((groups.clock[around] - moment) / MEET_TIMES, 3)
     fitted = basis @ np.linalg.lstsq(basis, groups.centers[around], rcond=None)[0]
     return float(np.square(groups.centers[around] - fitted).sum())
+
+
+def _change(groups: _Groups, before: list[int], after: list[int]) -> float:
+    """Distance of the colors of a path before and after a moment."""
+    if not (before and after):
+        return 0.0
+    return float(np.linalg.norm(np.median(groups.colors[before], axis=0) - np.median(groups.colors[after], axis=0)))
 
 
 def _smooth(groups: _Groups, path: list[int], clock: NDArray[np.float64], *, alone: bool = False) -> Trajectory:
