@@ -3,6 +3,8 @@
 import shlex
 import subprocess
 import sys
+from importlib import import_module
+from typing import Any
 
 _MOST = 2000  # characters of a text
 
@@ -54,6 +56,14 @@ def shown(value: object) -> str:
 def quoted(path: object) -> str:
     """A path as one word of a command that can be pasted."""
     return subprocess.list2cmdline([str(path)]) if sys.platform == "win32" else shlex.quote(str(path))
+
+
+def optional_module(name: str, need: str, extra: str) -> Any:
+    """Import a module of an extra. need: such as "writing .4dgs needs fourdgs". Raises InputError without it."""
+    try:
+        return import_module(name)
+    except ImportError:
+        raise InputError(f"{need}: {pip_install(extra)}") from None
 
 
 def pip_install(extra: str) -> str:

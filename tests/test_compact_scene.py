@@ -70,7 +70,7 @@ def test_exact_features_give_the_same_bits(device: Device, tmp_path: Path) -> No
     gaussians = file.gaussians | {"static_features": whole.static_features()}
     field = {name: values for name, values in file.field.items() if name != "static_grid.table"}
     without = SceneFile("", file.field_config, file.sh_degree, gaussians, field, {})
-    assert playback_of(without, device).means(0.3).tobytes() == whole.means(0.3).tobytes()
+    assert playback_of(without, device).at(0.3).means.read().tobytes() == whole.at(0.3).means.read().tobytes()
 
 
 def test_equal_scenes_give_equal_bytes(device: Device, tmp_path: Path) -> None:

@@ -78,7 +78,7 @@ def compact(device: Device, tmp_path_factory: pytest.TempPathFactory) -> list[by
 def shown_at_all_times(file: Path, device: Device) -> None:
     playback = open_playback(file, device)
     InitialView.from_json(playback.metadata.get("view", ""))
-    assert playback.means(0.5).shape == (playback.count, 3)
+    assert playback.at(0.5).means.read().shape == (playback.count, 3)
     assert len(playback.snapshot(1.0)) == playback.count
 
 

@@ -50,7 +50,7 @@ def test_usd(scene: LoadedScene, device: Device, tmp_path: Path, ending: str) ->
         positions = np.array(splats.GetPositionsAttr().Get(60 * t))
         seen = np.c_[positions, np.ones(len(positions))] @ to_screen
         seen = (seen[:, :2] / seen[:, 3:] * [0.5, -0.5] + 0.5) * [640, 480]
-        wanted, depth = ours.project(scene.playback.means(t).astype(float))
+        wanted, depth = ours.project(scene.playback.at(t).means.read().astype(float))
         assert np.abs(seen - wanted)[depth > 0.1].max() < 0.1
         now = scene.playback.at(t)
         turns = [[q.GetReal(), *q.GetImaginary()] for q in splats.GetOrientationsAttr().Get(60 * t)]
@@ -75,7 +75,7 @@ def test_a_sequence_and_back_to_usd(scene: LoadedScene, device: Device, tmp_path
     read = load_scene(tmp_path / "frames", lambda: device)
     assert (read.clock().frames, read.clock().seconds) == (4, pytest.approx(scene.clock().seconds))
     for t in (0.0, 1 / 3, 1.0):
-        np.testing.assert_array_equal(read.playback.means(t), scene.playback.means(t))
+        np.testing.assert_array_equal(read.playback.at(t).means.read(), scene.playback.at(t).means.read())
     assert export_usd(read, tmp_path / "b.usdc", 4).psnr > 30  # straight lines between what were four frames
     with pytest.raises(InputError, match="no field"):
         export_compact(read, tmp_path / "b.lapgs")

@@ -75,5 +75,5 @@ def test_a_scene_moves_by_its_timing_and_so_does_its_file(device: Device, tmp_pa
     scene.save(tmp_path / "scene.ply")
     assert torch.equal(load(tmp_path / "scene.ply", device).at(0.7).means, expected)
     shown = open_playback(tmp_path / "scene.ply", device)
-    np.testing.assert_allclose(shown.means(0.7), expected.numpy(), rtol=1e-5, atol=1e-5)
-    assert not np.allclose(shown.means(0.3), expected.numpy(), rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(shown.at(0.7).means.read(), expected.numpy(), rtol=1e-5, atol=1e-5)
+    assert not np.allclose(shown.at(0.3).means.read(), expected.numpy(), rtol=1e-5, atol=1e-5)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from lapgs_wgpu.gpu.device import Device
     from lapgs_wgpu.viewer.loaded_scene import LoadedScene
     from lapgs_wgpu.viewer.offscreen import OffscreenRenderer
-    from lapgs_wgpu.viewer.remote import Entry
     from lapgs_wgpu.viewer.view_state import ViewState
 
 _SIZE = (1280, 720)  # of a window or picture, where nothing else says it
@@ -41,15 +40,12 @@ def _view(arguments: list[str]) -> None:
         # Beside all that follows: the driver and its compiler take longer than the rest together.
         device = other.submit(_warm_device, given.device)
         # Before the scene is read, which may take a while: whether there is a place to show it.
-        entry = _entry(given) if job == "window" else None
+        show = _window(given) if job == "window" else partial(_JOBS[job], given)
         from lapgs_wgpu.viewer.loaded_scene import load_scene
 
         antialiased = None if given.antialiased is None else given.antialiased == "yes"
         scene = load_scene(Path(given.file), device.result, up=given.up, antialiased=antialiased)
-    if job == "window":
-        _window(given, scene, entry)
-    else:
-        {"screenshot": _screenshot, "video": _video, "export": _export}[job](given, scene)
+    show(scene)
 
 
 def _warm_device(name: str | None) -> Device:
@@ -61,27 +57,18 @@ def _warm_device(name: str | None) -> Device:
     return device
 
 
-def _entry(given: Any) -> Entry | None:
-    """Start listening for browsers; None for a window, after checking that one can be opened."""
+def _window(given: Any) -> Callable[[LoadedScene], None]:
+    """Start listening for browsers, or check that a window can be opened; returns what shows a scene there."""
+    start = partial(_start, given)
     if given.backend == "http":
-        from lapgs_wgpu.viewer.remote import open_entry
+        from lapgs_wgpu.viewer.remote import open_entry, run_remote
 
-        return open_entry(given.host or "127.0.0.1", 8080 if given.port is None else given.port)
-    from lapgs_wgpu.viewer.window import check_window
+        entry = open_entry(given.host or "127.0.0.1", 8080 if given.port is None else given.port)
+        return lambda scene: run_remote(scene, entry, start)
+    from lapgs_wgpu.viewer.window import check_window, run_window
 
     check_window(_WITHOUT_WINDOW)
-    return None
-
-
-def _window(given: Any, scene: LoadedScene, entry: Entry | None) -> None:
-    if entry is None:
-        from lapgs_wgpu.viewer.window import run_window
-
-        run_window(scene, given.size or _SIZE, partial(_start, given))
-    else:
-        from lapgs_wgpu.viewer.remote import run_remote
-
-        run_remote(scene, entry, partial(_start, given))
+    return lambda scene: run_window(scene, given.size or _SIZE, start)
 
 
 def _start(given: Any, state: ViewState) -> None:
@@ -200,6 +187,9 @@ def _export(given: Any, scene: LoadedScene) -> None:
             "where they offer antialiased drawing, turn it on; elsewhere thin places look a little thicker.",
             file=sys.stderr,
         )
+
+
+_JOBS = {"screenshot": _screenshot, "video": _video, "export": _export}
 
 
 def _named(name: str, ending: str, option: str) -> Path:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.errors import InputError, pip_install
+from lapgs_wgpu.errors import InputError, optional_module
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.atomic import atomic_write
@@ -40,10 +40,7 @@ def export_4dgs(scene: LoadedScene, file: Path, max_error: float) -> Loss:
     it, pixels of the captured images at the distance of the focus. Raises InputError where the file cannot be written,
     nothing moves or can be seen, or the package fourdgs is missing.
     """
-    try:
-        import fourdgs
-    except ImportError:
-        raise InputError(f"writing .4dgs needs fourdgs: {pip_install('export')}") from None
+    fourdgs = optional_module("fourdgs", "writing .4dgs needs fourdgs", "export")
     playback = scene.playback
     if not playback.moves:
         raise InputError(f"{scene.path}: holds no motion; --export FILE.ply writes it for other viewers.")

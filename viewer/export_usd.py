@@ -69,7 +69,9 @@ def _write(pxr: Any, stage: Any, scene: LoadedScene, frames: int) -> None:
     pxr.Usd.ColorSpaceAPI.Apply(prim).CreateColorSpaceNameAttr("srgb_rec709_display")
     types = pxr.Sdf.ValueTypeNames
     uniform = {"custom": False, "variability": pxr.Sdf.VariabilityUniform}
-    prim.CreateAttribute("radiance:sphericalHarmonicsDegree", types.Int, **uniform).Set(scene.playback.sh_degree)
+    prim.CreateAttribute("radiance:sphericalHarmonicsDegree", types.Int, **uniform).Set(
+        scene.playback.at(0.0).sh_degree
+    )
     attributes = {name: prim.CreateAttribute(name, getattr(types, kind), custom=False) for name, kind in _TYPES.items()}
     factors = plain_factors(scene).astype(np.float32)
     last: dict[str, tuple[int, Floats]] = {}  # what was written, and for which frame

@@ -110,7 +110,7 @@ class FrameRenderer:
     def _motion(self) -> tuple[DeviceArray, float]:
         """Return how far each Gaussian moves as its color (N, 3), and the distance at the end of the scale."""
         if self._moved is None:
-            places = np.stack([self.playback.means(t) for t in np.linspace(0, 1, _TIMES)])
+            places = np.stack([self.playback.at(t).means.read() for t in np.linspace(0, 1, _TIMES)])
             moved = np.linalg.norm(places - places.mean(axis=0), axis=2).max(axis=0).astype(np.float32)
             array = self._pool.upload("motion", np.repeat(moved[:, None], 3, axis=1))
             self._moved = array, max(float(np.percentile(moved, 98)) if len(moved) else 1.0, 1e-9)

@@ -104,7 +104,7 @@ def guess_view(playback: Playback, axis: str | None = None) -> InitialView:
     axis: of AHEAD, up. Where it is not known, up is -y, as in scenes whose poses come from COLMAP; z where the
     Gaussians lie flat in x and y, or move, as in D-NeRF's scenes.
     """
-    means = playback.means(0.0).astype(np.float64)
+    means = playback.at(0.0).means.read().astype(np.float64)
     if not len(means):
         means = np.zeros((1, 3))
     middle = np.median(means, axis=0)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.errors import InputError, pip_install
+from lapgs_wgpu.errors import InputError, optional_module
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.pool import BufferPool
@@ -21,10 +21,8 @@ from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.io.ply import GaussianSnapshot, vertex_of
 from lapgs_wgpu.io.ply_elements import open_ply
 from lapgs_wgpu.io.safe_json_toml import parse_json, read_json
-from lapgs_wgpu.motion.fields.config import FieldConfig
-from lapgs_wgpu.motion.playback.playback import activate
+from lapgs_wgpu.motion.playback.playback import activate, opacity_logits
 from lapgs_wgpu.motion.scene_file import SceneFile, read_scene
-from lapgs_wgpu.motion.timing import EVEN
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.constants import CONSTANTS
 from lapgs_wgpu.splat.gaussians import Gaussians
@@ -55,15 +53,13 @@ class MovingFile(NamedTuple):
 class SampledPlayback:
     """The Playback of a moving file. antialiased: how Gaussians are drawn, None for what the file says."""
 
-    field_config = FieldConfig(kind="static")
-    moves, timing = True, EVEN
+    moves = True
 
     def __init__(self, device: Device, file: MovingFile, antialiased: bool | None = None) -> None:
         self.device, self.metadata = device, file.metadata
         self._sample, self._pool, self._antialiased = file.sample, BufferPool(device), antialiased
         self._time: float | None = None
-        first = file.sample(0.0)
-        self.count, self.sh_degree = len(first), first.sh_degree or 0
+        self.count = len(file.sample(0.0))
 
     def at(self, t: float) -> Gaussians[DeviceArray]:
         if self._time != t:
@@ -73,14 +69,9 @@ class SampledPlayback:
             self._now, self._time = Gaussians(**arrays, antialiased=antialiased), t
         return self._now
 
-    def means(self, t: float) -> Floats:
-        return self._sample(t).means
-
     def snapshot(self, t: float) -> GaussianSnapshot:
         now = self._sample(t)
-        inside = np.clip(now.opacities.astype(np.float64), 1e-7, 1 - 1e-7)
-        logits = np.log(inside / (1 - inside)).astype(np.float32)
-        return GaussianSnapshot(now.means, now.sh, logits, np.log(now.scales), now.quats)
+        return GaussianSnapshot(now.means, now.sh, opacity_logits(now.opacities), np.log(now.scales), now.quats)
 
 
 def read_sequence(path: Path) -> MovingFile:
@@ -207,10 +198,7 @@ def _polynomial(
 
 def read_4dgs(path: Path) -> MovingFile:
     """Read straight pieces of motion by the format's library. Raises InputError."""
-    try:
-        import fourdgs
-    except ImportError:
-        raise InputError(f"reading .4dgs needs fourdgs: {pip_install('export')}") from None
+    fourdgs = optional_module("fourdgs", "reading .4dgs needs fourdgs", "export")
     data = path.read_bytes()
     try:
         scene = fourdgs.read(data)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import PurePath
 from typing import Any
 
@@ -92,7 +93,7 @@ def _parse(arguments: Sequence[str]) -> Any:
     add("--list-devices", action="store_const", const=True, help=LIST_DEVICES_HELP)
 
     add = parser.add_argument_group("content of the window, screenshot or video").add_argument
-    add("--time", type=_number(0.0, 1.0), metavar="T", help="time in the clip, from 0 to 1; also of --export FILE.ply; "
+    add("--time", type=_within(0.0, 1.0), metavar="T", help="time in the clip, from 0 to 1; also of --export FILE.ply; "
         "not for videos in which the clip plays [0, or the time of --view]")
     add("--mode", choices=list(MODES), help="; ".join(f"{mode}: {about}" for mode, about in MODES.items()) + " [rgb]")
     add("--background", choices=list(BACKGROUNDS), help="color behind the Gaussians [the training's, otherwise black]")
@@ -107,13 +108,14 @@ def _parse(arguments: Sequence[str]) -> Any:
     add = parser.add_argument_group("window").add_argument
     add("--time-slider", action="store_const", const=True, help="show the time slider [shown if the scene moves]")
     add("--play", action="store_const", const=True, help="start playing at once [paused]")
-    add("--fps", type=_number(0.1, 1000.0), metavar="F", help="frames a second at speed 1 and of --video [30]")
-    add("--speed", type=_number(0.01, 100.0), metavar="X", help="playback speed, a factor [1]")
+    add("--fps", type=_within(0.1, 1000.0), metavar="F", help="frames a second at speed 1 and of --video [30]")
+    add("--speed", type=_within(0.01, 100.0), metavar="X", help="playback speed, a factor [1]")
     add("--loop", choices=list(LOOPS), help="at the end of the clip: start again, play backwards, or stop [loop]")
     add("--backend", choices=("glfw", "http"), help="glfw: desktop window; http: web server for a browser (pip install "
         "'lapgs-wgpu[remote]') [glfw]")
     add("--host", metavar="ADDRESS", help="with --backend http: address to listen on [127.0.0.1: this machine only]")
-    add("--port", type=_whole(0, 65535), metavar="N", help="with --backend http: TCP port; 0: any free port [8080]")
+    add("--port", type=_within(0, 65535, int), metavar="N", help="with --backend http: TCP port; 0: any free port "
+        "[8080]")
 
     add = parser.add_argument_group("screenshot and video (no window); existing files are replaced").add_argument
     add("--screenshot", metavar="FILE.png", help="render one image")
@@ -121,7 +123,7 @@ def _parse(arguments: Sequence[str]) -> Any:
     add("--path", choices=("time", "view", "both"), help="of --video; time: static camera while the clip plays; "
         "view: one orbit at --time, to and fro where the capture has cameras on one side only; both: the same while "
         "the clip plays [time, or view if the scene does not move]")
-    add("--seconds", type=_number(0.001, 86400.0), metavar="S", help="length of --video [that of the clip; 6 for "
+    add("--seconds", type=_within(0.001, 86400.0), metavar="S", help="length of --video [that of the clip; 6 for "
         "view]")
 
     add = parser.add_argument_group("export (no window)").add_argument
@@ -129,10 +131,10 @@ def _parse(arguments: Sequence[str]) -> Any:
         ".lapgs: compact scene with its motion; .html: web page that plays it; .4dgs: motion as straight lines (pip "
         "install 'lapgs-wgpu[export]'); .usd, .usda, .usdz: OpenUSD with time samples (pip install "
         "'lapgs-wgpu[usd]'); DIR: a static .ply for each of --frames, and their manifest")
-    add("--max-error", type=_number(0.01, 100.0), metavar="PX", help="of a .4dgs: how far lines may be off the learned "
+    add("--max-error", type=_within(0.01, 100.0), metavar="PX", help="of a .4dgs: how far lines may be off the learned "
         "motion, pixels of the captured images at the focus [0.5]")
-    add("--frames", type=_whole(1, 100_000), metavar="N", help="of DIR and .usd: times, evenly from 0 to 1 [of .usd: "
-        "those of the clip, at least 61]")
+    add("--frames", type=_within(1, 100_000, int), metavar="N", help="of DIR and .usd: times, evenly from 0 to 1 "
+        "[of .usd: those of the clip, at least 61]")
     add("--overwrite", action="store_const", const=True, help="replace an existing file, or the frame_*.ply in DIR")
     # fmt: on
     arguments = list(arguments)
@@ -150,23 +152,12 @@ def _size(text: str) -> tuple[int, int]:
     return size
 
 
-def _number(low: float, high: float) -> Callable[[str], float]:
-    def number(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = float("nan")
-        if not low <= value <= high:
-            raise argparse.ArgumentTypeError(f"expected a number from {low:g} to {high:g}, got {text!r}")
-        return value
+def _within(low: float, high: float, kind: type = float) -> Callable[[str], Any]:
+    def number(text: str) -> Any:
+        with suppress(ValueError):
+            if low <= (value := kind(text)) <= high:
+                return value
+        what = "a whole number" if kind is int else "a number"
+        raise argparse.ArgumentTypeError(f"expected {what} from {low:g} to {high:g}, got {text!r}")
 
     return number
-
-
-def _whole(low: int, high: int) -> Callable[[str], int]:
-    def whole(text: str) -> int:
-        if not (re.fullmatch(r"[0-9]{1,9}", text) and low <= int(text) <= high):
-            raise argparse.ArgumentTypeError(f"expected a whole number from {low} to {high}, got {text!r}")
-        return int(text)
-
-    return whole

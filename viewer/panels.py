@@ -122,10 +122,10 @@ class Panels:
             imgui.progress_bar(last.step / last.steps, (-1, 0), f"step {last.step} of {last.steps}")
             imgui.text(f"{last.psnr:.2f} dB   {self.state.scene.playback.count:,} Gaussians")
         if _button("Go on" if training.paused else "Pause"):
-            training.toggle_pause()
+            self.state.toggle_pause()
         imgui.same_line()
         if _button("Step"):
-            training.step()
+            self.state.step_training()
         _tip("one step of the optimizer, then pause")
 
     # Texts over the picture ------------------------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.errors import InputError, pip_install
+from lapgs_wgpu.errors import InputError, optional_module
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.viewer.moving_files import MovingFile
 
@@ -61,9 +60,6 @@ def read_usd(path: Path) -> MovingFile:
 
 def load_pxr() -> Any:
     """Import usd-core. Raises InputError where it is missing."""
-    try:
-        for name in ("Gf", "Sdf", "Tf", "Usd", "UsdGeom", "UsdUtils", "Vt"):
-            importlib.import_module(f"pxr.{name}")
-    except ImportError:
-        raise InputError(f"OpenUSD files need usd-core: {pip_install('usd')}") from None
-    return importlib.import_module("pxr")
+    for name in ("Gf", "Sdf", "Tf", "Usd", "UsdGeom", "UsdUtils", "Vt"):
+        optional_module(f"pxr.{name}", "OpenUSD files need usd-core", "usd")
+    return optional_module("pxr", "OpenUSD files need usd-core", "usd")

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.errors import InputError, pip_install
+from lapgs_wgpu.errors import InputError, optional_module
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.camera import Camera
@@ -69,10 +69,7 @@ def write_video(
 
     Raises InputError where PyAV is missing or the file cannot be written.
     """
-    try:
-        import av
-    except ImportError as error:
-        raise InputError(f"writing mp4 needs PyAV: {pip_install('video')}") from error
+    av = optional_module("av", "writing mp4 needs PyAV", "video")
     rate = Fraction(fps).limit_denominator(65535)
     with (
         atomic_write(file) as target,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -26,22 +27,13 @@ class TrainingStep(Protocol):
     def psnr(self) -> float: ...
 
 
+@dataclass
 class TrainingControl:
     """Pauses a training. last: the last finished step. single: steps that still run although the training is paused."""
 
-    def __init__(self) -> None:
-        self.last: TrainingStep | None = None
-        self.paused = False
-        self.single = 0
-
-    def toggle_pause(self) -> None:
-        """Pause or continue."""
-        self.paused = not self.paused
-
-    def step(self) -> None:
-        """Run one step, then pause."""
-        self.paused = True
-        self.single += 1
+    last: TrainingStep | None = None
+    paused: bool = False
+    single: int = 0
 
 
 class ViewState:
@@ -118,11 +110,12 @@ class ViewState:
 
     def toggle_pause(self) -> None:
         if self.training is not None:
-            self.training.toggle_pause()
+            self.training.paused = not self.training.paused
 
     def step_training(self) -> None:
         if self.training is not None:
-            self.training.step()
+            self.training.paused = True
+            self.training.single += 1
 
 
 def _next(choices: Any, present: Any) -> Any:

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
-from lapgs_wgpu.errors import InputError, pip_install
+from lapgs_wgpu.errors import InputError, optional_module, pip_install
 from lapgs_wgpu.viewer.app import App
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 from lapgs_wgpu.viewer.view_state import ViewState
@@ -17,10 +17,7 @@ from lapgs_wgpu.viewer.view_state import ViewState
 def check_window(otherwise: str) -> None:
     """Raises InputError where no window can be opened here. otherwise: what works without one."""
     check_imgui()
-    try:
-        import glfw
-    except ImportError:
-        raise InputError(f"the window needs glfw: {pip_install('viewer')}.") from None
+    glfw = optional_module("glfw", "the window needs glfw", "viewer")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # it warns, and a window without this check would abort the process
         if glfw.init():

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.images import LANCZOS, ImageFile, Pixels, Size, encode_png, resize, shrunk_size, size_text
-from lapgs_wgpu.errors import InputError, pip_install
+from lapgs_wgpu.errors import InputError, optional_module
 from lapgs_wgpu.io.atomic import new_folder
 
 # Flags of swscale: bicubic, accurate rounding, chroma interpolated along rows. Its default darkens by 1 or 2 levels.
@@ -181,11 +181,5 @@ def _write(image: Pixels, size: Size, path: Path) -> None:
 
 def import_av(path: Path) -> Any:
     """The module PyAV. Raises InputError, which names the film, where it is not installed."""
-    try:
-        import av
-    except ImportError:
-        raise InputError(
-            f"{path} needs PyAV to be decoded: {pip_install('prepare')}, or extract its frames into "
-            f"{path.with_suffix('')}/images/*.png."
-        ) from None
-    return av
+    need = f"{path} needs PyAV to be decoded, where there are no {path.with_suffix('')}/images/*.png of its frames"
+    return optional_module("av", need, "prepare")

@@ -6,7 +6,6 @@ import itertools
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.lens import Lens
-from lapgs_wgpu.errors import InputError, pip_install
+from lapgs_wgpu.errors import optional_module
 from lapgs_wgpu.progress import Progress
 
 FEATURE_SIDE = 1600  # longer side, pixels: larger images are shrunk to find features
@@ -227,23 +226,16 @@ def neighbouring_pairs(names: Sequence[str]) -> list[Pair]:
 
 def import_pycolmap() -> Any:
     """The module pycolmap, which logs nothing. Raises InputError where it is not installed."""
-    module = _imported("pycolmap", "pycolmap, which finds out where the cameras stood")
+    module = optional_module("pycolmap", "finding out where the cameras stood needs pycolmap", "prepare")
     module.logging.minloglevel = int(module.logging.FATAL)
     return module
 
 
 def import_cv2() -> Any:
     """The module cv2 of OpenCV. Raises InputError where it is not installed."""
-    module = _imported("cv2", "OpenCV, which finds and follows features")
+    module = optional_module("cv2", "finding and following features needs OpenCV", "prepare")
     module.setRNGSeed(0)
     return module
-
-
-def _imported(name: str, what: str) -> Any:
-    try:
-        return import_module(name)
-    except ImportError:
-        raise InputError(f"{what}, is not installed: {pip_install('prepare')}.") from None
 
 
 def merged(source: Reconstruction, matches: Match, groups: Sequence[Sequence[str]], work: Path) -> Reconstruction:

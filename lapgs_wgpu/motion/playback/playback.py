@@ -14,10 +14,9 @@ from lapgs_wgpu.gpu.array import DeviceArray, read_all
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.io.ply import GaussianSnapshot
-from lapgs_wgpu.motion.fields.config import MIN_SCALE, FieldConfig
+from lapgs_wgpu.motion.fields.config import MIN_SCALE
 from lapgs_wgpu.motion.playback.grid_field_playback import GridFieldPlayback, runs_on_device
 from lapgs_wgpu.motion.scene_file import SceneFile
-from lapgs_wgpu.motion.timing import Timing
 from lapgs_wgpu.splat.gaussians import Gaussians
 
 Floats = NDArray[np.float32]
@@ -26,27 +25,19 @@ Floats = NDArray[np.float32]
 class Playback(Protocol):
     """A scene that can be rendered at any time in [0, 1].
 
-    count: number of Gaussians. moves: False for static scenes. timing: of the scene. metadata: of the checkpoint.
+    count: number of Gaussians. moves: False for static scenes. metadata: of the checkpoint.
     """
 
     device: Device
-    field_config: FieldConfig
     metadata: dict[str, str]
 
     @property
     def count(self) -> int: ...
     @property
-    def sh_degree(self) -> int: ...
-    @property
     def moves(self) -> bool: ...
-    @property
-    def timing(self) -> Timing: ...
 
     def at(self, t: float) -> Gaussians[DeviceArray]:
         """Return the activated Gaussians at a time, on the device. Does not wait for it. Valid until the next call."""
-
-    def means(self, t: float) -> Floats:
-        """Return the means (count, 3) at a time, world units."""
 
     def snapshot(self, t: float) -> GaussianSnapshot:
         """Return all Gaussians at a time, as 3DGS viewers read them. `Scene4D.save` writes those at time 0."""
@@ -71,10 +62,9 @@ class DevicePlayback:
     """A Playback of static scenes, and of fields that the device evaluates."""
 
     def __init__(self, file: SceneFile, device: Device) -> None:
-        self.device, self.field_config, self.metadata = device, file.field_config, file.metadata
-        self.count, self.sh_degree = len(file.gaussians["means"]), file.sh_degree
+        self.device, self.metadata, self._file = device, file.metadata, file
+        self.count = len(file.gaussians["means"])
         self.moves = file.field_config.kind != "static"
-        self._stored, self.timing = file.gaussians, file.timing
         activated = activate(file.gaussians, file.sh_degree)
         pool = BufferPool(device)
         names = {"means": "means", "quats": "quats", "scales": "scales", "opacities": "opacities", "sh": "colors"}
@@ -86,7 +76,7 @@ class DevicePlayback:
             self._field = GridFieldPlayback(device, file.field_config, file.field, activated)
 
     def at(self, t: float) -> Gaussians[DeviceArray]:
-        t = self.timing(t)
+        t = self._file.timing(t)
         if self._field is not None and self._time != t:
             self._field.move(t, self._now)
             self._time = t
@@ -96,17 +86,13 @@ class DevicePlayback:
         """Return the features (count, F) of a compact scene, which replace the static table; None in static scenes."""
         return self._field.static_features() if self._field else None
 
-    def means(self, t: float) -> Floats:
-        return self.at(t).means.read() if self.moves else self._stored["means"]
-
     def snapshot(self, t: float) -> GaussianSnapshot:
         now = self.at(t)
         means, quats, scales, opacities, colors = read_all([now.means, now.quats, now.scales, now.opacities, now.sh])
-        logits = self._stored["opacity_logits"]
-        if self.field_config.appearance_size == 4:
-            inside = np.clip(opacities.astype(np.float64), 1e-7, 1 - 1e-7)
-            logits = np.log(inside / (1 - inside)).astype(np.float32)
-        sh = np.concatenate([colors[:, :1], self._stored["sh_rest"]], axis=1)
+        logits = self._file.gaussians["opacity_logits"]
+        if self._file.field_config.appearance_size == 4:
+            logits = opacity_logits(opacities)
+        sh = np.concatenate([colors[:, :1], self._file.gaussians["sh_rest"]], axis=1)
         return GaussianSnapshot(means, sh, logits, np.log(scales), quats)
 
 
@@ -121,3 +107,9 @@ def activate(stored: dict[str, Floats], sh_degree: int) -> dict[str, Floats]:
         "opacities": 0.5 + 0.5 * np.tanh(0.5 * stored["opacity_logits"]),
         "colors": np.concatenate([stored["sh_dc"], stored["sh_rest"][:, :used]], axis=1),
     }
+
+
+def opacity_logits(opacities: Floats) -> Floats:
+    """Return the logits (N,) of opacities (N,), which are clipped to 1e-7 from 0 and 1."""
+    inside = np.clip(opacities.astype(np.float64), 1e-7, 1 - 1e-7)
+    return np.log(inside / (1 - inside)).astype(np.float32)

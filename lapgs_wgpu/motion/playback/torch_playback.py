@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.io.ply import GaussianSnapshot
 from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.motion.timing import Timing
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import upload_gaussians
 
@@ -25,7 +22,7 @@ class TorchPlayback:
 
     def __init__(self, scene: Scene4D) -> None:
         self.scene = scene
-        self.device, self.field_config, self.metadata = scene.device, scene.field_config, scene.metadata
+        self.device, self.metadata = scene.device, scene.metadata
         self._pool = BufferPool(scene.device)  # a training uses its own
         self._shown: Gaussians[DeviceArray] | None = None
         # Time and degree of what is shown, and id and version of each parameter.
@@ -35,14 +32,6 @@ class TorchPlayback:
     @property
     def count(self) -> int:
         return len(self.scene)
-
-    @property
-    def timing(self) -> Timing:
-        return self.scene.timing
-
-    @property
-    def sh_degree(self) -> int:
-        return self.scene.sh_degree
 
     @property
     def moves(self) -> bool:
@@ -61,10 +50,6 @@ class TorchPlayback:
             self._shown = upload_gaussians(self._pool, now)
             self._shown_of, self._parameters = wanted, parameters
         return self._shown
-
-    def means(self, t: float) -> NDArray[np.float32]:
-        with torch.no_grad():
-            return np.array(self.scene.at(t).means.numpy(force=True))
 
     def snapshot(self, t: float) -> GaussianSnapshot:
         return self.scene.snapshot(t)
