@@ -15,7 +15,7 @@ from lapgs_wgpu.data.images import encode_png
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.capture import prepare
 from lapgs_wgpu.prepare.flow import Motion
-from lapgs_wgpu.prepare.movers import Judged, depth_errors, in_mask, read_masks, rim, without
+from lapgs_wgpu.prepare.movers import RIM, Judged, depth_errors, in_mask, read_masks, without
 
 pycolmap = pytest.importorskip("pycolmap")
 pytest.importorskip("av")
@@ -163,7 +163,7 @@ def test_places_are_followed_and_lost() -> None:
 
 
 def test_matches_without_masked_features() -> None:
-    mask = rim()
+    mask = RIM
     size = (320, 240)
     places = np.array([[160.0, 120.0], [5.0, 5.0], [319.9, 239.9]])
     assert in_mask(mask, places, size).tolist() == [True, False, False]
@@ -181,5 +181,5 @@ def test_cameras_that_follow_what_moves_in_a_part_of_the_film() -> None:
     right = wrong._replace(errors=errors[1:] * 2)
     assert (wrong.contradicted(["a", "b"]), right.contradicted(["a", "b"])) == (["a"], [])
     assert right.explained(wrong) == pytest.approx(1.5)
-    wider = [mask.mean() for mask in wrong.turned_over(["a", "b"]).values()]
+    wider = [mask.mean() for mask in wrong.rough(["a", "b"], turned_over=True).values()]
     assert wider == [pytest.approx(1 / 3)] * 2

@@ -17,7 +17,8 @@ UP = np.array([0.0, 0.6, 0.8])
 
 @pytest.fixture
 def view() -> ViewCamera:
-    return ViewCamera([3.0, -1.0, 0.5], [0.2, 0.1, -0.3], UP, 0.7)
+    camera = Camera.looking_at([3.0, -1.0, 0.5], [0.2, 0.1, -0.3], up=UP, fov_x=0.7, width=100, height=100)
+    return ViewCamera(camera, [0.2, 0.1, -0.3], UP)
 
 
 def level(view: ViewCamera) -> bool:
@@ -80,7 +81,7 @@ def test_a_rolled_camera_turns_without_a_jump() -> None:
     T = np.eye(4)
     T[:3, :3] = turn @ camera.T_cam_world[:3, :3]
     T[:3, 3] = -T[:3, :3] @ camera.position
-    view = ViewCamera.of(Camera(camera.K, T, 64, 48), [0, 0, 0], [0, 0, 1])
+    view = ViewCamera(Camera(camera.K, T, 64, 48), [0, 0, 0], [0, 0, 1])
     before = view.rotation
     view.orbit(1e-3, 1e-3)
     assert np.abs(view.rotation - before).max() < 3e-3
@@ -94,7 +95,7 @@ def test_a_camera_keeps_the_near_plane_of_where_it_starts(view: ViewCamera) -> N
     start = dataclasses.replace(view.camera(400, 300), near=0.2)
     again = InitialView.from_json(InitialView(start, view.focus, view.up, 10).to_json())
     assert again is not None
-    moved = ViewCamera.of(again.camera, again.focus, again.up)
+    moved = ViewCamera(again.camera, again.focus, again.up)
     moved.orbit(0.1, 0.0)
     assert moved.camera(200, 100).near == 0.2
     assert view.camera(200, 100).near == 0.0

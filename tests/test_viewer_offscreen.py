@@ -163,7 +163,7 @@ def test_where_cameras_stand_on_one_side_a_turn_swings_between_them() -> None:
     assert look.arc_from(cameras[2]) == pytest.approx((35, 25))
     assert captured_arc(cameras[1], [standing(each) for each in range(0, 360, 60)], focus, up) is None
 
-    start = ViewCamera.of(cameras[1], focus, up)
+    start = ViewCamera(cameras[1], focus, up)
     places = np.stack([camera.position for camera, _ in orbit_views(start, (8, 6), 4, None, arc)])
     for place, degrees in zip(places, (0, -20, 0, 40), strict=True):
         np.testing.assert_allclose(place, standing(degrees).position, atol=1e-6)

@@ -21,22 +21,14 @@ class ViewCamera:
     near: depth up to which nothing is drawn, world units.
     """
 
-    def __init__(self, position: ArrayLike, focus: ArrayLike, up: ArrayLike, fov_y: float) -> None:
-        self.position: Vector = np.asarray(position, np.float64)
+    def __init__(self, camera: Camera, focus: ArrayLike, up: ArrayLike) -> None:
+        """Start where a camera stands; the focus is moved onto its line of sight."""
+        self.position: Vector = camera.position
         self.focus: Vector = np.asarray(focus, np.float64)
         self.up: Vector = _unit(np.asarray(up, np.float64))
-        self.fov_y, self.near = fov_y, 0.0
-        self.rotation = self._level(self.focus - self.position)
+        self.near = camera.near
+        self.stand_at(camera)
         self._start = (self.position, self.focus, self.rotation, self.fov_y)
-
-    @staticmethod
-    def of(camera: Camera, focus: ArrayLike, up: ArrayLike) -> ViewCamera:
-        """Make a camera that starts where another one stands; the focus is moved onto its line of sight."""
-        made = ViewCamera(camera.position, focus, up, 2 * math.atan(0.5 * camera.height / camera.K[1, 1]))
-        made.stand_at(camera)
-        made.near = camera.near
-        made._start = (made.position, made.focus, made.rotation, made.fov_y)
-        return made
 
     @property
     def distance(self) -> float:

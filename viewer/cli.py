@@ -141,7 +141,7 @@ def _video(given: Any, scene: LoadedScene) -> None:
     else:
         start, arc, time = scene.camera(), scene.initial_view.arc, 0.0
         if view is not None:
-            start = ViewCamera.of(view.camera, scene.initial_view.focus, scene.initial_view.up)
+            start = ViewCamera(view.camera, scene.initial_view.focus, scene.initial_view.up)
             arc, time = scene.initial_view.arc_from(view.camera), view.time
         if given.time is not None:
             time = given.time

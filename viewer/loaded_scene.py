@@ -40,7 +40,7 @@ class LoadedScene(NamedTuple):
 
     def camera(self) -> ViewCamera:
         """Make a camera where the viewer begins."""
-        return ViewCamera.of(self.initial_view.camera, self.initial_view.focus, self.initial_view.up)
+        return ViewCamera(self.initial_view.camera, self.initial_view.focus, self.initial_view.up)
 
     def clock(self) -> Clock:
         """Make the clock of the clip, at its start."""

@@ -43,10 +43,6 @@ class Entry(NamedTuple):
     def port(self) -> int:
         return int(self.listening.getsockname()[1])
 
-    def url(self, name: str) -> str:
-        """Return the address for a browser that reaches this machine under a name."""
-        return f"http://{name}:{self.port}/{self.token}/"
-
     def welcome(self, file: str) -> str:
         """Say which address to open, here and on another machine."""
         name = end = f"[{self.host}]" if ":" in self.host else self.host
@@ -54,10 +50,11 @@ class Entry(NamedTuple):
             name = end = "localhost"
         if self.host in _EVERYWHERE:
             name, end = socket.gethostname(), "localhost"
+        port, place = self.port, f"{self.port}/{self.token}/"
         lines = [
-            f"lapgs-view: {file} is shown at {self.url(name)} until Ctrl-C.",
-            f"From another machine: ssh -L {self.port}:{end}:{self.port} USER@THIS_MACHINE, then open "
-            f"{self.url('localhost')} there.",
+            f"lapgs-view: {file} is shown at http://{name}:{place} until Ctrl-C.",
+            f"From another machine: ssh -L {port}:{end}:{port} USER@THIS_MACHINE, then open "
+            f"http://localhost:{place} there.",
         ]
         if self.host not in _LOCAL:
             lines.append("Pictures and token go over the network as they are; through the tunnel they are encrypted.")

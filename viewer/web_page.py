@@ -127,7 +127,7 @@ def page_html(scene: bytes, title: str, poster: NDArray[np.uint8], *, narrowest:
         "policy": policy,
         "title": html.escape(title),
         "style": style,
-        "poster": f"data:image/jpeg;base64,{base64.b64encode(encode_jpeg(poster, quality=80)).decode()}",
+        "poster": f"data:image/jpeg;base64,{base64.b64encode(encode_jpeg(poster)).decode()}",
         "player": json.dumps(player_data(), separators=(",", ":")).replace("<", "\\u003c"),
         "scene": base64.b64encode(scene).decode(),
         "script": script,

@@ -176,9 +176,9 @@ def encode_png(image: Pixels, *, level: int = 6) -> bytes:
     return _encoded(image, ".png", compress_level=level)
 
 
-def encode_jpeg(image: Pixels, *, quality: int) -> bytes:
-    """Encode an image (H, W, 3) RGB as JPEG. quality: 1 to 95."""
-    return _encoded(image, ".jpg", quality=quality)
+def encode_jpeg(image: Pixels) -> bytes:
+    """Encode an image (H, W, 3) RGB as JPEG of quality 80, for a page."""
+    return _encoded(image, ".jpg", quality=80)
 
 
 def _encoded(image: Pixels, extension: str, **options: Any) -> bytes:

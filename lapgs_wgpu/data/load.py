@@ -20,7 +20,7 @@ from lapgs_wgpu.data.mover_cube import mover_cube
 from lapgs_wgpu.data.placement import place
 from lapgs_wgpu.data.readers import apps, colmap, hypernerf, panoptic, poses_bounds, transforms
 from lapgs_wgpu.data.stamps import natural_key
-from lapgs_wgpu.data.timestamps import as_one_camera, by_camera, disorder, held_out, in_step, read_times, to_unit_range
+from lapgs_wgpu.data.timestamps import as_one_camera, by_camera, disorder, held_out, in_step, read_times
 from lapgs_wgpu.data.validation import check_cloud, check_film, check_frames, check_plausible, check_views, upright
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
@@ -183,7 +183,8 @@ def _timed(folder: Path, capture: Capture, warnings: list[str]) -> tuple[list[Fr
         names = as_one_camera(names, times, [frame.place for frame in capture.frames])
         warnings += disorder(names, times, numbered=source.startswith("the frame numbers"))
         times = in_step(names, times)
-    times = to_unit_range(times, *(capture.time_range or (min(times), max(times))))
+    first, last = capture.time_range or (min(times), max(times))
+    times = [(time - first) / (last - first) if last > first else 0.0 for time in times]
     splits: list[Split] = [frame.split for frame in capture.frames if frame.split is not None]
     if not splits:
         tested = held_out(names, times)
@@ -197,17 +198,14 @@ def _timed(folder: Path, capture: Capture, warnings: list[str]) -> tuple[list[Fr
 def _masked(frames: Sequence[Frame], masks: Path | None, movers: Path | None) -> list[Frame]:
     """Give training frames the masks in the user's folder, in place of those that the capture names, and all frames
     those of what moves."""
-    out = list(frames)
     if masks is not None:
         names = [frame.name.file for frame in frames if frame.split == "train"]
         found = find_masks(masks, names, "each training image, named as the image")
-        out = [
-            dataclasses.replace(f, mask=found[f.name.file], mask_kind="white") if f.split == "train" else f for f in out
-        ]
+        frames = [dataclasses.replace(f, mask=found.get(f.name.file), mask_kind="white") for f in frames]
     if movers is not None:
         found = find_masks(movers, [frame.name.file for frame in frames], "each image, white where it moves")
-        out = [dataclasses.replace(frame, moving=found[frame.name.file]) for frame in out]
-    return out
+        frames = [dataclasses.replace(frame, moving=found[frame.name.file]) for frame in frames]
+    return list(frames)
 
 
 def _check_masks(frames: Sequence[Frame]) -> list[str]:

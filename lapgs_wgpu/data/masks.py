@@ -34,29 +34,24 @@ def check_mask_folder(folder: Path, what: str) -> None:
 
 
 def find_masks(folder: Path, names: Iterable[str], what: str) -> dict[str, Path]:
-    """Find the masks of all images by their names: NAME.png or NAME.jpg.png (COLMAP's way) below a folder.
+    """Find the masks of all images by their names: NAME.png or NAME.jpg.png (COLMAP's way) below a folder. Names may
+    differ as in `CaptureFiles.find`, and lack the folder where all images lie in one.
 
     what: the images and how masks are named, for errors. Raises InputError: no such folder, or a mask is missing.
     """
     check_mask_folder(folder, what)
-    masks, missing = _found(folder, names)
-    if missing:
-        count = f"{len(missing)} of {len(missing) + len(masks)}"
-        raise InputError(f"{folder} lacks {count} masks, such as that of {missing[0]}; add a PNG for {what}.")
-    return masks
-
-
-def _found(folder: Path, names: Iterable[str]) -> tuple[dict[str, Path], list[str]]:
-    """The masks below a folder by image, and the images without. Names may differ as in `CaptureFiles.find`, and lack
-    the folder where all images lie in one."""
     files, paths = CaptureFiles(folder), {name: PurePosixPath(name) for name in names}
     one = len({path.parent for path in paths.values()}) == 1
     found = {}
     for name, path in paths.items():
         masks = [PurePosixPath(f"{path}.png"), path.with_suffix(".png")]
         masks += [PurePosixPath(mask.name) for mask in masks if one]
-        found[name] = next((file for mask in masks if (file := files.find(str(mask)))), None)
-    return {name: folder / file for name, file in found.items() if file}, [name for name in found if not found[name]]
+        if file := next((file for mask in masks if (file := files.find(str(mask)))), None):
+            found[name] = folder / file
+    if missing := [name for name in paths if name not in found]:
+        count = f"{len(missing)} of {len(paths)}"
+        raise InputError(f"{folder} lacks {count} masks, such as that of {missing[0]}; add a PNG for {what}.")
+    return found
 
 
 def check_mask_size(path: Path, size: Size) -> None:
@@ -103,8 +98,13 @@ def read_mask(
     The mask is first resized to `stored` by nearest neighbours. A pixel in which several mix is set if any of them is;
     `above` as in `MOSTLY`. Raises InputError.
     """
-    pixels = resize(as_pixels(_set(_levels(decode(path)), kind)), stored, NEAREST)
+    pixels = resize(as_pixels(decode_mask(path, kind)), stored, NEAREST)
     return shrink(pixels if undistortion is None else undistortion.apply(pixels), size)[..., 0] > above
+
+
+def decode_mask(path: Path, kind: MaskKind = "white") -> Mask:
+    """The pixels (H, W) that a mask sets. Raises InputError."""
+    return _set(_levels(decode(path)), kind)
 
 
 def _set(levels: NDArray[np.uint8], kind: MaskKind) -> Mask:

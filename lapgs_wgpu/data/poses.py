@@ -56,18 +56,13 @@ def world_to_camera(R_world_cam: Array, position: Array) -> Array:
     An inexact rotation is replaced by the nearest one: the position follows from a pose by the rotation's inverse, and
     its error is that of the rotation times the distance from the origin.
     """
-    R_world_cam = nearest_rotation(R_world_cam, float(np.linalg.norm(position)))
+    reach = max(float(np.linalg.norm(position)), 1.0)
+    if np.abs(R_world_cam.T @ R_world_cam - np.eye(3)).max() * reach > EXACT:
+        U, _, V = np.linalg.svd(R_world_cam)
+        R_world_cam = U @ V
     T_cam_world = np.eye(4)
     T_cam_world[:3, :3], T_cam_world[:3, 3] = R_world_cam.T, -R_world_cam.T @ position
     return T_cam_world
-
-
-def nearest_rotation(R: Array, reach: float) -> Array:
-    """Return the rotation nearest to R (3, 3), or R where its error times `reach`, or 1, is at most EXACT."""
-    if np.abs(R.T @ R - np.eye(3)).max() * max(reach, 1.0) <= EXACT:
-        return R
-    U, _, V = np.linalg.svd(R)
-    return np.asarray(U @ V)
 
 
 def opengl_pose(value: Any, where: str) -> Array:

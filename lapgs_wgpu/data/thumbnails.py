@@ -20,17 +20,12 @@ def sharpness(gray: NDArray[np.float32]) -> float:
     return float((gray[:-2, 1:-1] + gray[2:, 1:-1] + gray[1:-1, :-2] + gray[1:-1, 2:] - 4 * inner).var())
 
 
-def sharpness_around(values: Array) -> Array:
-    """(N,) median sharpness of the images before and after each, in the order of time; of a single image its own."""
-    if len(values) < 2:
-        return values
-    near = (np.delete(values[max(i - AROUND, 0) : i + AROUND + 1], min(i, AROUND)) for i in range(len(values)))
-    return np.array([np.median(around) for around in near])
-
-
 def blurred(values: Array) -> NDArray[np.bool_]:
-    """(N,) whether each image is blurred, by the sharpness of all, in the order of time."""
-    return values < BLURRED * sharpness_around(values)
+    """(N,) whether each image is much less sharp than those around it, by the sharpness of all in the order of time."""
+    if len(values) < 2:
+        return np.zeros(len(values), bool)
+    near = (np.delete(values[max(i - AROUND, 0) : i + AROUND + 1], min(i, AROUND)) for i in range(len(values)))
+    return values < BLURRED * np.array([np.median(around) for around in near])
 
 
 def repeats(gray: NDArray[np.float32], before: NDArray[np.float32]) -> bool:

@@ -40,11 +40,6 @@ def read_times(names: Sequence[ImageName], folder: Path) -> tuple[list[float], s
     return [float(number) for number in frame_numbers(names)], f"the frame numbers in {whose}"
 
 
-def to_unit_range(values: Sequence[float], first: float, last: float) -> list[float]:
-    """Scale times so that `first` becomes 0 and `last` 1; all become 0 if the two are equal."""
-    return [(value - first) / (last - first) if last > first else 0.0 for value in values]
-
-
 def time_step(times: NDArray[np.float64]) -> float:
     """The usual difference of ascending times (T,); 1 for a single one."""
     return float(np.median(np.diff(times))) if len(times) > 1 else 1.0

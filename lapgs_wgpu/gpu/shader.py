@@ -18,7 +18,7 @@ from __future__ import annotations
 import functools
 import re
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -94,13 +94,11 @@ def compose(name: str, defines: Defines) -> str:
     defines = enabled(defines)
     imported: set[str] = set()
 
-    def _expand_lines(lines: list[str], file: str) -> list[str]:
+    def expanded(lines: Iterator[str], file: str, *, unrolled: bool = False) -> list[str]:
+        """All lines, or those up to the #end of an #unroll."""
         out: list[str] = []
         conditions: list[bool] = []
-        i = 0
-        while i < len(lines):
-            line = lines[i]
-            i += 1
+        for line in lines:
             directive = _DIRECTIVE.match(line)
             word, argument = directive.groups() if directive else ("", "")
             if word in ("ifdef", "ifndef"):
@@ -114,25 +112,27 @@ def compose(name: str, defines: Defines) -> str:
             elif word == "import":
                 if argument not in imported:
                     imported.add(argument)
-                    out += _expand_lines(shader_text(argument).splitlines(), argument)
+                    out += expanded(iter(shader_text(argument).splitlines()), argument)
             elif word == "table":
                 out.append(_table(argument, "TEXTURES" in defines, file))
             elif word == "unroll":
                 variable, count = argument.split()
-                end = _matching_end(lines, i, file)
-                body = _expand_lines(lines[i:end], file)
+                body = expanded(lines, file, unrolled=True)
                 for k in range(int(_substitute(count, defines, file))):
                     out += [re.sub(rf"\$\({variable}\)|\${variable}\b", str(k), text) for text in body]
-                i = end + 1
+            elif word == "end" and unrolled:
+                unrolled = False
+                break
             elif word:
                 raise ShaderError(f"shaders/{file}.wgsl: unknown directive #{word}")
             else:
                 out.append(_substitute(line, defines, file) if "$" in line else line)
-        if conditions:
-            raise ShaderError(f"shaders/{file}.wgsl: #ifdef without #endif")
+        if conditions or unrolled:
+            left_open = "#ifdef without #endif" if conditions else "#unroll without #end"
+            raise ShaderError(f"shaders/{file}.wgsl: {left_open}")
         return out
 
-    return "\n".join(_expand_lines(shader_text(name).splitlines(), name)) + "\n"
+    return "\n".join(expanded(iter(shader_text(name).splitlines()), name)) + "\n"
 
 
 def _table(argument: str, texture: bool, file: str) -> str:
@@ -152,19 +152,6 @@ def _table(argument: str, texture: bool, file: str) -> str:
         f"{declaration} {name}: texture_storage_2d<{texel_format}, read>;\n"
         f"fn {name}_at(i: u32) -> {kind} {{ return {texel}{components}; }}"
     )
-
-
-def _matching_end(lines: list[str], start: int, file: str) -> int:
-    depth = 1
-    for i in range(start, len(lines)):
-        directive = _DIRECTIVE.match(lines[i])
-        if directive and directive[1] == "unroll":
-            depth += 1
-        elif directive and directive[1] == "end":
-            depth -= 1
-            if depth == 0:
-                return i
-    raise ShaderError(f"shaders/{file}.wgsl: #unroll without #end")
 
 
 def _substitute(text: str, defines: Defines, file: str) -> str:

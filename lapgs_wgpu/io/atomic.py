@@ -30,16 +30,15 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
-        _remove(temporary)
         if not path.parent.exists():
             raise InputError(f"{path}: not written, since the folder {path.parent} does not exist; make it.") from error
         raise InputError(
             f"{path}: not written ({error.strerror or error}), and what was there before is unchanged; "
             "free some space or choose a folder that can be written to"
         ) from error
-    except BaseException:
-        _remove(temporary)
-        raise
+    finally:
+        with suppress(OSError):  # it has the file's name by now, or the folder may be missing or read-only
+            temporary.unlink()
     _sync_folder(path)
 
 
@@ -62,11 +61,6 @@ def new_folder(folder: Path, advice: str = "make room there, or name another") -
         raise InputError(f"{folder} cannot be written ({error.strerror or error}); {advice}.") from None
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
-
-
-def _remove(path: Path) -> None:
-    with suppress(OSError):  # the folder may be missing or read-only; report the first error
-        path.unlink()
 
 
 def _sync_folder(path: Path) -> None:

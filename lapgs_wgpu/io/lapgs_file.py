@@ -25,11 +25,12 @@ _HEADER = struct.Struct("<8sIQ")  # magic, version, bytes once unpacked
 _MOST_RATIO = 64  # of unpacked bytes to packed ones: a small file cannot fill the memory of who opens it
 
 
-def is_lapgs(path: PathLike) -> bool:
-    """Whether a file begins as a compact scene does; False where it cannot be read."""
-    with suppress(ValueError), open_regular(path) as file:
-        return file.read(len(MAGIC)) == MAGIC
-    return False
+def lapgs_bytes(path: PathLike) -> bytes | None:
+    """The bytes of a file that begins as a compact scene does, at most some more than MAX_BYTES; None of others."""
+    with suppress(InputError), open_regular(path) as file:
+        if (begin := file.read(len(MAGIC))) == MAGIC:
+            return begin + file.read(MAX_BYTES)
+    return None
 
 
 def pack_lapgs(tensors: Mapping[str, NDArray[Any]], metadata: Mapping[str, str]) -> bytes:
@@ -50,17 +51,11 @@ def pack_lapgs(tensors: Mapping[str, NDArray[Any]], metadata: Mapping[str, str])
     return _HEADER.pack(MAGIC, version, len(content)) + packed
 
 
-def read_lapgs(path: PathLike) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
-    """Tensors and metadata of a compact scene. Memory: the file, and twice what it unpacks to, at most MAX_BYTES.
-
-    Raises InputError where the file cannot be read, is damaged, or comes from a later version.
-    """
-    with open_regular(path) as file:
-        return unpack_lapgs(file.read(MAX_BYTES + 1), str(path))
-
-
 def unpack_lapgs(data: bytes, where: str) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
-    """As `read_lapgs`, of the bytes of a file. where: begins the message of an InputError."""
+    """Tensors and metadata of a compact scene. Memory: twice what it unpacks to, at most MAX_BYTES.
+
+    where: begins the message of an InputError, for data that is damaged or of a later version.
+    """
     if len(data) < _HEADER.size or not data.startswith(MAGIC):
         raise InputError(f"{where}: lacks the header of a compact scene ({_HEADER.size} bytes); the file is damaged")
     _, version, size = _HEADER.unpack_from(data)

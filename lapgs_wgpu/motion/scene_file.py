@@ -16,7 +16,7 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.io.dataclass_table import build_dataclass
 from lapgs_wgpu.io.initial_view import InitialView
-from lapgs_wgpu.io.lapgs_file import is_lapgs, pack_lapgs, read_lapgs, unpack_lapgs
+from lapgs_wgpu.io.lapgs_file import lapgs_bytes, pack_lapgs, unpack_lapgs
 from lapgs_wgpu.io.safe_json_toml import parse_json
 from lapgs_wgpu.motion.compact_scene import compress, expand
 from lapgs_wgpu.motion.fields.config import FieldConfig
@@ -56,8 +56,8 @@ class SceneFile:
 
 def read_scene(path: str | os.PathLike[str]) -> SceneFile:
     """Read a checkpoint, a compact scene, or any 3DGS .ply file as a static scene. Raises InputError."""
-    if is_lapgs(path):
-        return _expanded(*read_lapgs(path), path)
+    if (data := lapgs_bytes(path)) is not None:
+        return read_compact(data, path)
     still, tensors, metadata = read_checkpoint(path)
     if not tensors:
         sh = np.zeros((len(still.means), 16, 3), np.float32)
@@ -70,11 +70,9 @@ def read_scene(path: str | os.PathLike[str]) -> SceneFile:
             "gaussians.sh_dc": sh[:, :1],
             "gaussians.sh_rest": sh[:, 1:],
         }
-        config, degree, timing = FieldConfig(kind="static"), still.sh_degree, EVEN
-        antialiased = metadata.get("antialiased") == "true"
-    else:
-        config, degree, antialiased, timing = _read_header(metadata, path)
-    count = len(still.means)
+        metadata |= {"field": '{"kind": "static"}', "sh_degree": str(still.sh_degree)}
+    header = _read_header(metadata, path)
+    config, count = header["field_config"], len(still.means)
     gaussians = {
         name: _tensor(tensors, f"gaussians.{name}", (count, *shape), path) for name, shape in row_shapes(config).items()
     }
@@ -83,20 +81,15 @@ def read_scene(path: str | os.PathLike[str]) -> SceneFile:
     if config.kind == "own":  # its module, which checks them, comes from elsewhere
         shapes = {name[6:]: array.shape for name, array in tensors.items() if name.startswith("field.")}
     field = {name: _tensor(tensors, f"field.{name}", shape, path) for name, shape in shapes.items()}
-    return SceneFile(path, config, degree, gaussians, field, _texts(metadata), antialiased, timing)
+    return SceneFile(path, gaussians=gaussians, field=field, **header)
 
 
 def read_compact(data: bytes, path: str | os.PathLike[str]) -> SceneFile:
     """As `read_scene`, of the bytes of a compact scene. path: where they are from."""
-    return _expanded(*unpack_lapgs(data, str(path)), path)
-
-
-def _expanded(
-    tensors: Mapping[str, NDArray[Any]], metadata: Mapping[str, str], path: str | os.PathLike[str]
-) -> SceneFile:
-    config, degree, antialiased, timing = _read_header(metadata, path)
-    arrays = expand(tensors, config, degree, str(path))
-    return SceneFile(path, config, degree, *arrays, _texts(metadata), antialiased, timing)
+    tensors, metadata = unpack_lapgs(data, str(path))
+    header = _read_header(metadata, path)
+    gaussians, field = expand(tensors, header["field_config"], header["sh_degree"], str(path))
+    return SceneFile(path, gaussians=gaussians, field=field, **header)
 
 
 def compact_bytes(file: SceneFile, static_features: NDArray[np.float32] | None, *, finer: float = 1.0) -> bytes:
@@ -130,18 +123,14 @@ def scene_header(config: FieldConfig, sh_degree: int, antialiased: bool, timing:
     return header
 
 
-def _texts(metadata: Mapping[str, str]) -> dict[str, str]:
-    of_header = ("field", "sh_degree", "antialiased", "timing")
-    return {key: value for key, value in metadata.items() if key not in of_header}
-
-
 def row_shapes(config: FieldConfig) -> dict[str, tuple[int, ...]]:
     """Return the parameters of each Gaussian with this field: name -> shape of a row."""
     size = config.dynamics_size
     return _SHAPES | ({"dynamics": (size,)} if size else {})
 
 
-def _read_header(metadata: Mapping[str, str], path: str | os.PathLike[str]) -> tuple[FieldConfig, int, bool, Timing]:
+def _read_header(metadata: Mapping[str, str], path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Return the attributes of a SceneFile that its texts hold, and the others of these."""
     try:
         config = build_dataclass(FieldConfig, parse_json(metadata["field"], "its text"), "field")
         degree = int(metadata["sh_degree"])
@@ -157,7 +146,9 @@ def _read_header(metadata: Mapping[str, str], path: str | os.PathLike[str]) -> t
             f"{path}: the checkpoint's description of its field cannot be read ({reason}): "
             "it was damaged, or written by another version of lapgs_wgpu"
         ) from error
-    return config, degree, antialiased == "true", timing
+    others = {key: text for key, text in metadata.items() if key not in ("field", "sh_degree", "antialiased", "timing")}
+    described = {"field_config": config, "sh_degree": degree, "antialiased": antialiased == "true", "timing": timing}
+    return described | {"metadata": others}
 
 
 def _tensor(

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.io.safe_json_toml import parse_json
 
-_MOST = 1_000_000  # times
 MOST_TIMES = 20_000  # that the header of a checkpoint has room for
 
 
@@ -20,11 +19,22 @@ class Timing:
 
     times: (M,) float64, ascending. With none, each time is its own moment. moments: (M,) float64, never descending:
     those at these times. Between two times the difference of moment and time changes evenly; outside of all it is that
-    of the nearest time.
+    of the nearest time. Raises ValueError for others.
     """
 
     times: NDArray[np.float64]
     moments: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        for name, values in vars(self).items():
+            if values.ndim != 1 or values.dtype != np.float64 or not ((values >= 0) & (values <= 1)).all():
+                raise ValueError(f"timing.{name} are not numbers between 0 and 1")
+        if len(self.times) != len(self.moments):
+            raise ValueError(f"timing has {len(self.times)} times and {len(self.moments)} moments")
+        if (np.diff(self.times) <= 0).any():
+            raise ValueError("timing.times do not ascend")
+        if (np.diff(self.moments) < 0).any():
+            raise ValueError("timing.moments descend")
 
     def __call__(self, t: float) -> float:
         """Return the moment at a time in [0, 1]; at others that of the nearest end. Raises ValueError for NaN."""
@@ -46,25 +56,7 @@ def timing_of_text(text: str) -> Timing:
     table = parse_json(text, "its timing")
     if not isinstance(table, dict) or table.keys() != {"times", "moments"}:
         raise ValueError("timing is no table of times and moments")
-    return checked_timing(*(_numbers(table[name], name) for name in ("times", "moments")))
-
-
-def checked_timing(times: NDArray[np.float64], moments: NDArray[np.float64]) -> Timing:
-    """Return a timing of these times and moments, in [0, 1]. Raises ValueError where they are none."""
-    for name, values in (("times", times), ("moments", moments)):
-        if values.ndim != 1 or values.dtype != np.float64 or not ((values >= 0) & (values <= 1)).all():
+    for name, values in table.items():
+        if not isinstance(values, list) or not values or not all(type(each) in (int, float) for each in values):
             raise ValueError(f"timing.{name} are not numbers between 0 and 1")
-    if len(times) != len(moments):
-        raise ValueError(f"timing has {len(times)} times and {len(moments)} moments")
-    if (np.diff(times) <= 0).any():
-        raise ValueError("timing.times do not ascend")
-    if (np.diff(moments) < 0).any():
-        raise ValueError("timing.moments descend")
-    return Timing(times, moments)
-
-
-def _numbers(values: object, name: str) -> NDArray[np.float64]:
-    real = isinstance(values, list) and 0 < len(values) <= _MOST and all(type(each) in (int, float) for each in values)
-    if not real:
-        raise ValueError(f"timing.{name} are not numbers between 0 and 1")
-    return np.array(values, np.float64)
+    return Timing(**{name: np.array(values, np.float64) for name, values in table.items()})

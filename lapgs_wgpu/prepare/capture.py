@@ -22,7 +22,7 @@ from lapgs_wgpu.prepare.film import Film
 from lapgs_wgpu.prepare.flow import Motion, film_frames
 from lapgs_wgpu.prepare.images import Picture, extract, images_per_second
 from lapgs_wgpu.prepare.inputs import open_inputs
-from lapgs_wgpu.prepare.movers import cut_out, judge, read_masks, rim, without, write_masks
+from lapgs_wgpu.prepare.movers import RIM, cut_out, judge, read_masks, without, write_masks
 from lapgs_wgpu.prepare.poses import Floats, Match, Reconstruction, import_cv2, import_pycolmap, neighbouring_pairs
 from lapgs_wgpu.prepare.rig import place_calibrated, place_still
 from lapgs_wgpu.prepare.search import Found, again, described, longest_part, search
@@ -180,7 +180,7 @@ def _without_movers(
             break
         of = "the images' rims" if rims else "what disagrees"
         say(f"{seen.moving:.0%} of the image area disagrees with these cameras: trying {of} alone.")
-        hidden = dict.fromkeys(source.names, rim()) if rims else seen.turned_over(source.names)
+        hidden = dict.fromkeys(source.names, RIM) if rims else seen.rough(source.names, turned_over=True)
         source.use(without(matches, source.places, hidden, size))
         other = search(source, size, rival=True)
         if other is not None and len(other.placed) >= FEWEST * len(source.names):

@@ -16,10 +16,9 @@ from lapgs_wgpu.data import Dataset, View, load_dataset
 from lapgs_wgpu.data.cloud import in_view, points_in_view
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.images import Pixels
-from lapgs_wgpu.data.masks import Mask
+from lapgs_wgpu.data.masks import Mask, decode_mask
 from lapgs_wgpu.data.readers.colmap import IMAGES
 from lapgs_wgpu.prepare.capture_folder import MASKS
-from lapgs_wgpu.prepare.movers import read_mask
 from lapgs_wgpu.prepare.path import AROUND, STEP, TURN, path_faults
 from lapgs_wgpu.prepare.poses import Floats
 from lapgs_wgpu.progress import Progress
@@ -131,7 +130,7 @@ def _mask(folder: Path, view: View) -> Mask | None:
     if not image.is_relative_to(folder / IMAGES):
         return None
     path = folder / MASKS / image.relative_to(folder / IMAGES).with_suffix(".png")
-    return read_mask(path) if path.is_file() else None
+    return decode_mask(path) if path.is_file() else None
 
 
 def _points(dataset: Dataset) -> Floats:

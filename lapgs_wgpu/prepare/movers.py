@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.images import Size, check_image, decode, encode_png
-from lapgs_wgpu.data.masks import WHITE, Mask, check_mask_size, find_masks
+from lapgs_wgpu.data.images import Size, encode_png
+from lapgs_wgpu.data.masks import Mask, check_mask_size, decode_mask, find_masks
 from lapgs_wgpu.prepare.flow import REACH, Motion
 from lapgs_wgpu.prepare.poses import Floats, Match, Plane, import_cv2
 
@@ -31,6 +31,7 @@ MOVES = 5.0  # times the noise, at least: it moves
 HALO = 1.5  # times the error that parts what moves from the rest: flow bends around what moves
 SHARP = 2.5  # times the noise of the better of two reconstructions: it agrees
 LITTLE = 0.002  # share of an image: a smaller mask is noise
+RIM = np.pad(np.ones((42, 42), bool), 9)  # mask of all but an image's rim, which seldom shows what moves
 AROUND, INSIDE = 10, 5  # pixels around what moves, where colors decide; within it, where they do not
 
 
@@ -67,22 +68,16 @@ class Judged(NamedTuple):
         pairs = zip(names, self.errors, strict=True)
         return [name for name, errors in pairs if (errors > MOVES).sum() > 0.5 * max(np.isfinite(errors).sum(), 1)]
 
-    def rough(self, names: Sequence[str]) -> dict[str, Mask]:
-        """Masks on the grid, a little wider than what moves."""
-        cv2 = import_cv2()
-        masks = [(vote > self.limit).astype(np.uint8) for vote in self.votes]
-        return {name: cv2.dilate(mask, np.ones((3, 3), np.uint8)) > 0 for name, mask in zip(names, masks, strict=True)}
-
-    def turned_over(self, names: Sequence[str]) -> dict[str, Mask]:
-        """Masks on the grid of what agrees, a little wider, in images that disagree at least half as much as the worst
-        one: their cameras may follow what moves. Of the others as `rough`."""
-        cv2 = import_cv2()
-        shares = [(vote > self.limit).mean() for vote in self.votes]
-        masks = self.rough(names)
-        for name, errors, share in zip(names, self.errors, shares, strict=True):
-            if share >= max(shares) / 2:
-                masks[name] = cv2.dilate((errors < SHARP).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-        return masks
+    def rough(self, names: Sequence[str], *, turned_over: bool = False) -> dict[str, Mask]:
+        """Masks on the grid, a little wider than what moves. turned_over: than what agrees, in images that disagree at
+        least half as much as the worst one: their cameras may follow what moves."""
+        masks = [vote > self.limit for vote in self.votes]
+        if turned_over:
+            worst = max(mask.mean() for mask in masks)
+            pairs = zip(masks, self.errors, strict=True)
+            masks = [errors < SHARP if mask.mean() >= worst / 2 else mask for mask, errors in pairs]
+        wider = [import_cv2().dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0 for mask in masks]
+        return dict(zip(names, wider, strict=True))
 
 
 def judge(motion: Motion, names: Sequence[str], model: Any) -> Judged:
@@ -121,7 +116,8 @@ def unexplained(motion: Motion, names: Sequence[str], model: Any) -> tuple[list[
         tracks = {k: at for k, at in motion.tracks(i).items() if poses[i + k] is not None}
         if poses[i] is None or len(tracks) < FEWEST:
             return np.full(motion.grid.shape[0] * motion.grid.shape[1], np.nan), [], np.zeros((0, 0))
-        relative = [_relative(poses[i], poses[i + k]) for k in tracks]
+        relative = [poses[i + k][:, :3] @ poses[i][:, :3].T for k in tracks]
+        relative = [(R, poses[i + k][:, 3] - R @ poses[i][:, 3]) for k, R in zip(tracks, relative, strict=True)]
         seen = np.stack([directions(at) for at in tracks.values()])
         sigma = np.array([noise[abs(k)] for k in tracks]) / focal
         total, each = depth_errors(directions(motion.grid), seen, relative, sigma, 1 / (NEAR * nearest))
@@ -167,12 +163,6 @@ def depth_errors(
         squares = np.square(np.minimum(error, MOST)) * known
         total = np.minimum(total, np.sqrt(squares.sum(axis=0) / np.maximum(known.sum(axis=0), 1)))
     return np.where(known.sum(axis=0) >= FEWEST, total, np.nan), np.where(known, error, np.nan)
-
-
-def _relative(one: Floats, other: Floats) -> tuple[Floats, Floats]:
-    """Rotation and translation from one camera to another one, of two (3, 4) poses."""
-    R = other[:, :3] @ one[:, :3].T
-    return R, other[:, 3] - R @ one[:, 3]
 
 
 def _votes(motion: Motion, errors: Sequence[Plane]) -> list[Plane]:
@@ -237,11 +227,6 @@ def in_mask(mask: Mask | None, places: NDArray[np.floating], size: Size) -> Mask
     return mask[row, column]
 
 
-def rim() -> Mask:
-    """Mask of seven tenths of the width and height of an image of any size, whose rim seldom shows what moves."""
-    return np.pad(np.ones((42, 42), bool), 9)
-
-
 def write_masks(folder: Path, masks: Mapping[str, Mask]) -> None:
     """Write PNG images below a folder, white where something moves, under the images' names."""
     for name, mask in masks.items():
@@ -256,10 +241,4 @@ def read_masks(folder: Path, names: Sequence[str], size: Size) -> dict[str, Mask
     paths = find_masks(folder, names, "each image in images/ of a first run without --masks, with the same --fps")
     for path in paths.values():
         check_mask_size(path, size)
-    return {name: read_mask(path) for name, path in paths.items()}
-
-
-def read_mask(path: Path) -> Mask:
-    """(h, w), white where something moves. Raises InputError."""
-    check_image(path, whole=False)
-    return decode(path)[..., 0] >= WHITE
+    return {name: decode_mask(path) for name, path in paths.items()}

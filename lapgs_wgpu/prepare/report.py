@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import io
 from html import escape
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from PIL import Image
 
 from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.data.evenly import evenly
-from lapgs_wgpu.data.images import Pixels, decode
+from lapgs_wgpu.data.images import Pixels, decode, encode_jpeg
 from lapgs_wgpu.data.masks import Mask
 from lapgs_wgpu.data.readers.colmap import IMAGES
 from lapgs_wgpu.errors import InputError
@@ -79,9 +78,7 @@ def _figure(image: Pixels, mask: Mask | None, label: str) -> str:
     if mask is not None:
         over = np.asarray(Image.fromarray(mask.astype(np.uint8) * 255).resize(size, Image.Resampling.BILINEAR))
         small += STRENGTH * over[..., None] / 255 * (RED - small)
-    file = io.BytesIO()
-    Image.fromarray(small.round().astype(np.uint8)).save(file, "JPEG", quality=80)
-    source = base64.b64encode(file.getvalue()).decode()
+    source = base64.b64encode(encode_jpeg(small.round().astype(np.uint8))).decode()
     return f'<figure><img alt="" src="data:image/jpeg;base64,{source}">{escape(label)}</figure>'
 
 

@@ -18,7 +18,7 @@ from lapgs_wgpu.errors import NumericalError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView, captured_arc
 from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.motion.timing import Timing, checked_timing
+from lapgs_wgpu.motion.timing import Timing
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.train.camera_refinement import CameraRefinement
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config
@@ -302,7 +302,7 @@ class Trainer:
             scene.field.load_state_dict(parts["field"])
         self._learners.restore(parts)
         if timing := {name: value.numpy() for name, value in parts.get("timing", {}).items()}:
-            scene.timing = checked_timing(**timing)
+            scene.timing = Timing(**timing)
         self._density.statistics = Statistics(**parts["statistics"])
         own = parts["training"]
         self.done, scene.sh_degree = int(own["done"]), int(own["sh_degree"])

@@ -47,20 +47,10 @@ class HashEncoder:
         *,
         lane_levels: bool | None = None,
     ) -> None:
-        self.groups = [list(group) for group in groups]
-        self._passes = [HashEncoderPasses(device, group, bound, lane_levels=lane_levels) for group in self.groups]
+        self.grids = [grid for group in groups for grid in group]
+        self._passes = [HashEncoderPasses(device, group, bound, lane_levels=lane_levels) for group in groups]
         self._pool = BufferPool(device)
         self._device = device
-
-    @property
-    def grids(self) -> list[HashGrid]:
-        """The grids of all groups."""
-        return [grid for group in self.groups for grid in group]
-
-    @property
-    def features(self) -> list[int]:
-        """Length of a point's encoding, for each group."""
-        return [sum(grid.features for grid in group) for group in self.groups]
 
     def encode_all(self, places: Sequence[Place]) -> list[list[Tensor]]:
         """Encode sets of points, each at its own time: of each an (N, features) float32 tensor for each group.
@@ -69,7 +59,7 @@ class HashEncoder:
         """
         detached = [(points.detach(), time) for points, time in places]
         outputs = _Encode.apply(self, detached, *[grid.table for grid in self.grids])
-        count = len(self.groups)
+        count = len(self._passes)
         return [list(outputs[i : i + count]) for i in range(0, len(outputs), count)]
 
     def encode(self, places: Sequence[Place], tables: Sequence[Tensor]) -> list[Tensor]:
@@ -78,9 +68,8 @@ class HashEncoder:
         for array, table in zip(arrays, tables, strict=True):
             array.write(_host(table))
         with Commands(self._device) as commands:
-            for points, encodings in sets:
-                for passes, of_group, encoding in self._by_group(points, arrays, encodings):
-                    passes.encode(commands, points, of_group, encoding)
+            for passes, *arguments in self._by_group(sets, arrays):
+                passes.encode(commands, *arguments)
         return _read([array for _, encodings in sets for array in encodings], places)
 
     def backward(self, places: Sequence[Place], d_encodings: Sequence[Tensor]) -> list[Tensor]:
@@ -93,9 +82,8 @@ class HashEncoder:
         with Commands(self._device) as commands:
             for array in arrays:
                 commands.clear(array)
-            for points, encodings in sets:
-                for passes, of_group, encoding in self._by_group(points, arrays, encodings):
-                    passes.add_gradient(commands, points, encoding, of_group)
+            for passes, points, tables, encoding in self._by_group(sets, arrays):
+                passes.add_gradient(commands, points, encoding, tables)
         return _read(arrays, places)
 
     def _tables(self) -> list[DeviceArray]:
@@ -113,20 +101,19 @@ class HashEncoder:
             uploaded = PointSet(
                 number, self._pool.upload(f"points {number}", padded), len(points), partial(float, time)
             )
-            shapes = [(len(points), features) for features in self.features]
+            shapes = [(len(points), sum(grid.features for grid in passes.grids)) for passes in self._passes]
             encodings = [self._pool.array(f"encoding {number} {group}", shape) for group, shape in enumerate(shapes)]
             sets.append((uploaded, encodings))
         return sets
 
     def _by_group(
-        self, points: PointSet, tables: Sequence[DeviceArray], encodings: Sequence[DeviceArray]
-    ) -> Iterator[tuple[HashEncoderPasses, list[DeviceArray], DeviceArray]]:
-        """Passes, tables and encoding of each group; nothing where there are no points."""
-        rest = iter(tables)
-        for passes, encoding in zip(self._passes, encodings, strict=True):
-            of_group = list(itertools.islice(rest, len(passes.grids)))
-            if points.count:
-                yield passes, of_group, encoding
+        self, sets: Sequence[tuple[PointSet, list[DeviceArray]]], tables: Sequence[DeviceArray]
+    ) -> Iterator[tuple[HashEncoderPasses, PointSet, list[DeviceArray], DeviceArray]]:
+        """Passes, points, tables and encoding of each set and group, but of sets without points."""
+        for points, encodings in sets:
+            rest = iter(tables)
+            for passes, encoding in zip(self._passes, encodings if points.count else (), strict=False):
+                yield passes, points, list(itertools.islice(rest, len(passes.grids))), encoding
 
 
 def _read(arrays: Sequence[DeviceArray], places: Sequence[Place]) -> list[Tensor]:
