@@ -15,7 +15,6 @@ from lapgs_wgpu.data.views import composite
 from lapgs_wgpu.gpu.device import open_device
 from lapgs_wgpu.motion.playback.playback import DevicePlayback, playback_of
 from lapgs_wgpu.motion.scene_file import compact_bytes, read_scene
-from lapgs_wgpu.viewer.capture_views import capture_views
 from lapgs_wgpu.viewer.loaded_scene import load_scene
 from lapgs_wgpu.viewer.offscreen import OffscreenRenderer
 
@@ -23,7 +22,7 @@ from lapgs_wgpu.viewer.offscreen import OffscreenRenderer
 def mean_psnr(path: Path, run: Path) -> float:
     """PSNR of the scene in a file on the test views of a run's capture, dB."""
     scene = load_scene(path, open_device)
-    views = [view for view in capture_views(load_scene(run / "checkpoint.ply", open_device)) if "test" in view.name]
+    views = [view for view in load_scene(run / "checkpoint.ply", open_device).views() if "test" in view.name]
     if not views:
         raise SystemExit(f"{run}: its capture is not here")
     draw = OffscreenRenderer(scene)

@@ -13,7 +13,7 @@ from PIL import Image
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.cloud import Cloud
-from lapgs_wgpu.data.mover_cube import mover_cube
+from lapgs_wgpu.data.placement import mover_cube
 from lapgs_wgpu.data.views import composite, small_views
 from lapgs_wgpu.discovery.cutouts import cutout_tracks
 from lapgs_wgpu.discovery.residual import Residual

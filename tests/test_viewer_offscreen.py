@@ -21,7 +21,6 @@ from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.evaluate import to_8_bit
 from lapgs_wgpu.viewer import offscreen as offscreen_module
-from lapgs_wgpu.viewer.capture_views import capture_views
 from lapgs_wgpu.viewer.cli import view_command
 from lapgs_wgpu.viewer.offscreen import framed
 
@@ -270,5 +269,5 @@ def test_the_capture_opens_as_the_training_opened_it(
     )
     (tmp_path / "config.toml").write_text(f'[data]\npath = "{tmp_path}"\nsize = 200\nmovers = "masks"\n{line}\n')
     scene = SimpleNamespace(path=tmp_path / "checkpoint.ply", playback=SimpleNamespace(metadata={}))
-    assert capture_views(scene) == ("a", "b")  # type: ignore[arg-type]
+    assert LoadedScene.views(scene) == ("a", "b")  # type: ignore[arg-type]
     assert opened == [{"image_size": 200, "undistort": expected, "movers": "masks"}]

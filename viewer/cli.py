@@ -73,14 +73,13 @@ def _window(given: Any) -> Callable[[LoadedScene], None]:
 
 def _start(given: Any, state: ViewState) -> None:
     """Set the state as the options say. Raises InputError where the scene lacks the mode or the view."""
-    from lapgs_wgpu.viewer.capture_views import find_view
     from lapgs_wgpu.viewer.offscreen import check_mode
 
     if given.mode is not None:
         check_mode(state.scene, state.renderer, given.mode)
         state.mode = given.mode
     if given.view is not None:
-        name = find_view(state.scene, given.view).name
+        name = state.scene.view(given.view).name
         state.stand_at([view.name for view in state.views].index(name))
     state.background = BACKGROUNDS.get(given.background, state.background)
     state.show_transport = bool(given.time_slider or state.show_transport)
@@ -98,13 +97,12 @@ def _renderer(given: Any, scene: LoadedScene) -> OffscreenRenderer:
 
 
 def _screenshot(given: Any, scene: LoadedScene) -> None:
-    from lapgs_wgpu.viewer.capture_views import find_view
     from lapgs_wgpu.viewer.offscreen import framed, write_png
 
     file = _named(given.screenshot, ".png", "--screenshot")
     time = given.time or 0.0
     if given.view is not None:
-        view = find_view(scene, given.view)
+        view = scene.view(given.view)
         camera = framed(view.camera, *given.size) if given.size else view.camera
         time = view.time if given.time is None else given.time
     else:
@@ -118,14 +116,13 @@ def _video(given: Any, scene: LoadedScene) -> None:
 
     from lapgs_wgpu.viewer import video
     from lapgs_wgpu.viewer.camera import ViewCamera
-    from lapgs_wgpu.viewer.capture_views import find_view
     from lapgs_wgpu.viewer.offscreen import framed
 
     file = _named(given.video, ".mp4", "--video")
     path = given.path or ("time" if scene.playback.moves else "view")
     if path != "view" and given.time is not None:
         raise InputError(f"--time has no use with --path {path}, along which time passes.")
-    view = find_view(scene, given.view) if given.view is not None else None
+    view = scene.view(given.view) if given.view is not None else None
 
     fps = given.fps or 30.0
     seconds = 6.0 if path == "view" else scene.clock().frames / fps

@@ -6,14 +6,16 @@ import dataclasses
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.stamps import natural_key
+from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView
+from lapgs_wgpu.io.safe_json_toml import read_toml
 from lapgs_wgpu.motion.playback.playback import Playback, playback_of
 from lapgs_wgpu.motion.scene_file import SceneFile, read_scene
 from lapgs_wgpu.splat.camera import Camera
@@ -23,6 +25,9 @@ from lapgs_wgpu.viewer.clock import Clock
 from lapgs_wgpu.viewer.options import USD
 from lapgs_wgpu.viewer.render_modes import AHEAD, BACKGROUNDS
 from lapgs_wgpu.viewer.usd_file import read_usd
+
+if TYPE_CHECKING:
+    from lapgs_wgpu.data import View
 
 _ELEVATION = math.radians(35)  # of the guessed camera above the middle
 _FLAT = 0.5  # of the extents along x and y: what is lower lies on the ground
@@ -46,6 +51,35 @@ class LoadedScene(NamedTuple):
         """Make the clock of the clip, at its start."""
         fps = float(self.playback.metadata.get("fps", 30))
         return Clock(self.initial_view.frames if self.playback.moves else 1, fps=fps)
+
+    def views(self) -> tuple[View, ...]:
+        """The views of the capture that the config.toml beside a checkpoint names, those held out first; none where the
+        scene is of no run, or the capture is not here."""
+        from lapgs_wgpu.data import load_dataset  # not before the first picture
+
+        try:
+            data = read_toml(self.path.parent / "config.toml")["data"]
+            dataset = load_dataset(
+                Path(data["path"]),
+                image_size=int(data["size"]) or None,
+                undistort=bool(data.get("undistort", True)),
+                movers=data.get("movers") or None,  # which tell where the scene lies
+            )
+        except (OSError, ValueError, KeyError, TypeError, OverflowError):  # InputError is a ValueError
+            return ()
+        return (*dataset.test, *dataset.train)
+
+    def view(self, wanted: str) -> View:
+        """The view of the capture with this name, or number in the order of `views`. Raises InputError."""
+        views = self.views()
+        if not views:
+            raise InputError(
+                f"--view {wanted}: beside {self.path} is no config.toml that names a capture which is here."
+            )
+        by_name = {str(number): view for number, view in enumerate(views)} | {view.name: view for view in views}
+        if wanted not in by_name:
+            raise InputError(f"--view {wanted}: views are 0 to {len(views) - 1}, {views[0].name} to {views[-1].name}.")
+        return by_name[wanted]
 
     @property
     def background(self) -> tuple[float, float, float]:

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
 
-from lapgs_wgpu.viewer.capture_views import capture_views
 from lapgs_wgpu.viewer.clock import LOOPS, SPEEDS
 from lapgs_wgpu.viewer.frame import FrameRenderer
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
@@ -59,7 +58,7 @@ class ViewState:
     @cached_property
     def views(self) -> tuple[View, ...]:
         """The capture that the scene was trained on, where it is here. The first frame does not wait for it."""
-        return capture_views(self.scene)
+        return self.scene.views()
 
     def stand_at(self, view: int) -> None:
         """Go to a camera of the capture and to its time."""

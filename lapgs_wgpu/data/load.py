@@ -16,8 +16,7 @@ from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import SUFFIXES, Pixels, Size, shrink, shrunk_size
 from lapgs_wgpu.data.lens import Lens, Undistortion
 from lapgs_wgpu.data.masks import MOSTLY, Mask, MaskKind, check_masks, find_masks, read_mask
-from lapgs_wgpu.data.mover_cube import mover_cube
-from lapgs_wgpu.data.placement import place
+from lapgs_wgpu.data.placement import mover_cube, place
 from lapgs_wgpu.data.readers import apps, colmap, hypernerf, panoptic, poses_bounds, transforms
 from lapgs_wgpu.data.stamps import natural_key
 from lapgs_wgpu.data.timestamps import as_one_camera, by_camera, disorder, held_out, in_step, read_times
