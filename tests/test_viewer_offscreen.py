@@ -22,6 +22,7 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.evaluate import to_8_bit
 from lapgs_wgpu.viewer import offscreen as offscreen_module
 from lapgs_wgpu.viewer.cli import view_command
+from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 from lapgs_wgpu.viewer.offscreen import framed
 
 pytestmark = pytest.mark.triangles

@@ -120,7 +120,9 @@ class GridField(nn.Module):
 
     def _decode(self, t: float, dynamics: Tensor | None, static: Tensor, temporal: Tensor | None = None) -> Tensor:
         """Return the outputs of the geometry heads (N, 14) and, in further columns, of the appearance head."""
-        inputs = static, temporal, dynamics if self.config.dynamics_size else None
+        count, size = len(static), self.config.dynamics_size
+        temporal = static.new_zeros(count, 0) if temporal is None else temporal
+        inputs = static, temporal, dynamics if size and dynamics is not None else static.new_zeros(count, size)
         if not len(self.hidden):
             return decode(*inputs, self._weights(t))
         # In blocks, which avoids large allocations. For many Gaussians the backward pass computes them again: the
@@ -128,11 +130,10 @@ class GridField(nn.Module):
         decode_block = self._decode_hidden
         if len(static) > KEPT:
             decode_block = partial(checkpoint, decode_block, use_reentrant=False, preserve_rng_state=False)
-        count = -(-len(static) // _BLOCK) or 1
-        blocks = zip(*([None] * count if part is None else part.split(_BLOCK) for part in inputs), strict=True)
+        blocks = zip(*(part.split(_BLOCK) for part in inputs), strict=True)
         return torch.cat([decode_block(t, *block) for block in blocks])
 
-    def _decode_hidden(self, t: float, static: Tensor, temporal: Tensor | None, dynamics: Tensor | None) -> Tensor:
+    def _decode_hidden(self, t: float, static: Tensor, temporal: Tensor, dynamics: Tensor) -> Tensor:
         """Return the same after the hidden layers: `decode` gives what these read, and the gated channels, which the
         appearance head reads."""
         fused, *gated = decode(static, temporal, dynamics, self._weights(t)).split(self.config.width, dim=1)
@@ -159,7 +160,8 @@ class GridField(nn.Module):
             heads = torch.cat([head.weight for head in layers]) * factors[:, None]
             bias = torch.cat([head.bias for head in layers]) * factors
             moved = sum(GEOMETRY)  # heads that the motion reaches
-        inner = inner_bias = motion_heads = None
+        inner, inner_bias = heads.new_zeros(0, self.static_grid.features), heads.new_zeros(0)
+        motion_heads = heads.new_zeros(len(heads), 0)
         if self.motion is not None:
             (inner, inner_bias), second = self.motion.layers(t)
             folded, shift = (heads[:moved] @ factor for factor in second)
@@ -169,8 +171,8 @@ class GridField(nn.Module):
         return DecoderWeights(
             spatial=0.5 * self.spatial.weight,
             spatial_bias=0.5 * self.spatial.bias,
-            temporal=self.temporal.weight[:, size:] if self.config.temporal_hash else None,
-            dynamics=self.temporal.weight[:, :size] if size else None,
+            temporal=self.temporal.weight[:, size:] if self.config.temporal_hash else self.temporal.weight[:, :0],
+            dynamics=self.temporal.weight[:, :size],
             temporal_bias=self.temporal.bias,
             inner=inner,
             inner_bias=inner_bias,

@@ -25,7 +25,7 @@ Result = TypeVar("Result")
 
 
 class DecoderWeights(NamedTuple):
-    """Weights (outputs, inputs) and biases (outputs,) of the layers, float32; None: the field has no such layer.
+    """Weights (outputs, inputs) and biases (outputs,) of the layers, float32. What a field lacks has size 0.
 
     spatial: of the gate, halved, which is exact; reads static features. temporal, dynamics: of what the gate
     multiplies; read temporal features and dynamics attributes. inner: of the motion, rectified; reads static features.
@@ -34,17 +34,17 @@ class DecoderWeights(NamedTuple):
 
     spatial: Tensor
     spatial_bias: Tensor
-    temporal: Tensor | None
-    dynamics: Tensor | None
+    temporal: Tensor
+    dynamics: Tensor
     temporal_bias: Tensor
-    inner: Tensor | None
-    inner_bias: Tensor | None
+    inner: Tensor
+    inner_bias: Tensor
     heads: Tensor
-    motion_heads: Tensor | None
+    motion_heads: Tensor
     heads_bias: Tensor
 
 
-def decode(static: Tensor, temporal: Tensor | None, dynamics: Tensor | None, weights: DecoderWeights) -> Tensor:
+def decode(static: Tensor, temporal: Tensor, dynamics: Tensor, weights: DecoderWeights) -> Tensor:
     """Return the outputs (N, outputs) of the heads: with the layers' outputs x (spatial), y (temporal) and z (inner),
     relu(y) (2 sigmoid(x) - 1) heads^T + relu(z) motion_heads^T + heads_bias (Grid4D; paper eqs. 6 and 9).
 
@@ -57,15 +57,11 @@ def decode(static: Tensor, temporal: Tensor | None, dynamics: Tensor | None, wei
 
 class _Inputs(NamedTuple):
     static: Tensor
-    temporal: Tensor | None
-    dynamics: Tensor | None
-
-    def each(self, function: Callable[[Tensor], Tensor]) -> _Inputs:
-        temporal, dynamics = (None if each is None else function(each) for each in (self.temporal, self.dynamics))
-        return _Inputs(function(self.static), temporal, dynamics)
+    temporal: Tensor
+    dynamics: Tensor
 
     def rows(self, block: slice) -> _Inputs:
-        return self.each(lambda each: each[block])
+        return _Inputs(*(each[block] for each in self))
 
 
 class _Activations(NamedTuple):
@@ -74,12 +70,12 @@ class _Activations(NamedTuple):
     gate: Tensor
     moving: Tensor
     gated: Tensor
-    inner: Tensor | None
+    inner: Tensor
 
 
 class _Decode(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, static: Tensor, temporal: Tensor | None, dynamics: Tensor | None, *given: Any) -> Tensor:
+    def forward(ctx: Any, static: Tensor, temporal: Tensor, dynamics: Tensor, *given: Any) -> Tensor:
         weights, inputs = DecoderWeights(*given), _Inputs(static, temporal, dynamics)
         outputs = weights.heads.new_empty(len(static), len(weights.heads))
         keep = any(ctx.needs_input_grad) and len(static) <= KEPT
@@ -87,8 +83,7 @@ class _Decode(torch.autograd.Function):
         def decode_block(block: slice) -> tuple[Tensor | None, ...]:
             activations, target = _activations(inputs.rows(block), weights), outputs[block]
             torch.addmm(weights.heads_bias, activations.gated, weights.heads.T, out=target)
-            if activations.inner is not None and weights.motion_heads is not None:
-                target.addmm_(activations.inner, weights.motion_heads.T)
+            target.addmm_(activations.inner, weights.motion_heads.T)
             return activations if keep else (None,) * len(activations)
 
         kept = _each_block(decode_block, len(static))
@@ -100,7 +95,7 @@ class _Decode(torch.autograd.Function):
     def backward(ctx: Any, *d_results: Tensor) -> tuple[Tensor | None, ...]:
         saved, sizes = ctx.saved_tensors, (len(_Inputs._fields), len(DecoderWeights._fields))
         inputs, weights = _Inputs(*saved[: sizes[0]]), DecoderWeights(*saved[sizes[0] : sum(sizes)])
-        d_inputs = inputs.each(torch.empty_like)
+        d_inputs = _Inputs(*map(torch.empty_like, inputs))
         kept = zip(*[iter(saved[sum(sizes) :])] * len(_Activations._fields), strict=True)
 
         def differentiate_block(block: slice, own: tuple[Any, ...]) -> DecoderWeights:
@@ -109,21 +104,15 @@ class _Decode(torch.autograd.Function):
             return _backward(here, activations, d_results[0][block], weights, d_inputs.rows(block))
 
         parts = zip(*_each_block(differentiate_block, len(inputs.static), kept), strict=True)
-        return (*d_inputs, *(None if part[0] is None else sum(part[1:], part[0]) for part in parts))
+        return (*d_inputs, *(sum(part[1:], part[0]) for part in parts))
 
 
 def _activations(inputs: _Inputs, w: DecoderWeights) -> _Activations:
     # 2 sigmoid(x) - 1 = tanh(x / 2), by torch's sigmoid, which takes a tenth of the time of its tanh.
     gate = torch.addmm(w.spatial_bias, inputs.static, w.spatial.T).mul_(2).sigmoid_().mul_(2).sub_(1)
     moving = w.temporal_bias.repeat(len(gate), 1)
-    if inputs.temporal is not None and w.temporal is not None:
-        moving.addmm_(inputs.temporal, w.temporal.T)
-    if inputs.dynamics is not None and w.dynamics is not None:
-        moving.addmm_(inputs.dynamics, w.dynamics.T)
-    moving.relu_()
-    inner = None
-    if w.inner is not None and w.inner_bias is not None:
-        inner = torch.addmm(w.inner_bias, inputs.static, w.inner.T).relu_()
+    moving.addmm_(inputs.temporal, w.temporal.T).addmm_(inputs.dynamics, w.dynamics.T).relu_()
+    inner = torch.addmm(w.inner_bias, inputs.static, w.inner.T).relu_()
     return _Activations(gate, moving, moving * gate, inner)
 
 
@@ -136,24 +125,20 @@ def _backward(
     d_moving = torch.ops.aten.threshold_backward(d_gated * gate, moving, 0)
     d_gate = torch.ops.aten.tanh_backward(d_gated.mul_(moving), gate)
     torch.mm(d_gate, w.spatial, out=d_inputs.static)
-    d_inner = None
-    if inner is not None and w.inner is not None and w.motion_heads is not None:
-        d_inner = torch.ops.aten.threshold_backward(d @ w.motion_heads, inner, 0)
-        d_inputs.static.addmm_(d_inner, w.inner)
-    if d_inputs.temporal is not None and w.temporal is not None:
-        torch.mm(d_moving, w.temporal, out=d_inputs.temporal)
-    if d_inputs.dynamics is not None and w.dynamics is not None:
-        torch.mm(d_moving, w.dynamics, out=d_inputs.dynamics)
+    d_inner = torch.ops.aten.threshold_backward(d @ w.motion_heads, inner, 0)
+    d_inputs.static.addmm_(d_inner, w.inner)
+    torch.mm(d_moving, w.temporal, out=d_inputs.temporal)
+    torch.mm(d_moving, w.dynamics, out=d_inputs.dynamics)
     return DecoderWeights(
         spatial=d_gate.T @ inputs.static,
         spatial_bias=d_gate.sum(0),
-        temporal=None if inputs.temporal is None else d_moving.T @ inputs.temporal,
-        dynamics=None if inputs.dynamics is None else d_moving.T @ inputs.dynamics,
+        temporal=d_moving.T @ inputs.temporal,
+        dynamics=d_moving.T @ inputs.dynamics,
         temporal_bias=d_moving.sum(0),
-        inner=None if d_inner is None else d_inner.T @ inputs.static,
-        inner_bias=None if d_inner is None else d_inner.sum(0),
+        inner=d_inner.T @ inputs.static,
+        inner_bias=d_inner.sum(0),
         heads=d.T @ gated,
-        motion_heads=None if inner is None else d.T @ inner,
+        motion_heads=d.T @ inner,
         heads_bias=d.sum(0),
     )
 
