@@ -5,11 +5,12 @@ from __future__ import annotations
 import shutil
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from types import TracebackType
-from typing import TextIO
+from typing import TextIO, TypeVar
 
+T = TypeVar("T")
 TERMINAL_SECONDS = 0.25  # between two updates of the line on a terminal
 FILE_SECONDS = 15.0  # between two lines where stderr is no terminal
 
@@ -68,6 +69,14 @@ class Progress:
         with suppress(OSError):  # a closed pipe or a full disk behind stderr does not stop the job
             self._stream.write(text)
             self._stream.flush()
+
+
+def counted(items: Iterable[T], total: int, what: str) -> Iterator[T]:
+    """The items, each a step of a Progress once it was worked on."""
+    with Progress(total, what) as progress:
+        for item in items:
+            yield item
+            progress.step()
 
 
 def in_place(line: str) -> str:

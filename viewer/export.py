@@ -14,7 +14,7 @@ from lapgs_wgpu.io.ply import write_ply
 from lapgs_wgpu.motion.compact_scene import held_rows
 from lapgs_wgpu.motion.playback.playback import DevicePlayback, playback_of
 from lapgs_wgpu.motion.scene_file import SceneFile, compact_bytes, read_compact, read_scene
-from lapgs_wgpu.progress import Progress
+from lapgs_wgpu.progress import counted
 from lapgs_wgpu.viewer.export_loss import Loss, measure, of_playback
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene, nearest_axis
 from lapgs_wgpu.viewer.moving_files import MANIFEST, SampledPlayback, read_sequence
@@ -67,10 +67,8 @@ def export_frames(scene: LoadedScene, folder: Path, frames: int, *, overwrite: b
         file.unlink()
     digits = max(4, len(str(frames - 1)))
     names = [f"frame_{number:0{digits}}.ply" for number in range(frames)]
-    with Progress(frames, "frames") as progress:
-        for name, time in zip(names, np.linspace(0, 1, frames).tolist(), strict=True):
-            _write_still(scene, folder / name, time)
-            progress.step()
+    for name, time in zip(counted(names, frames, "frames"), np.linspace(0, 1, frames).tolist(), strict=True):
+        _write_still(scene, folder / name, time)
     manifest = {
         "fps": max(1, frames - 1) / scene.clock().seconds,  # so that they last as long as the clip
         "up": nearest_axis(scene.initial_view.up),

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.gpu.array import read_all
 from lapgs_wgpu.io.atomic import atomic_write
-from lapgs_wgpu.progress import Progress
+from lapgs_wgpu.progress import counted
 from lapgs_wgpu.viewer.export_loss import Loss, measure, of_playback
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene, direction, nearest_axis
 from lapgs_wgpu.viewer.moving_files import SampledPlayback
@@ -75,21 +75,19 @@ def _write(pxr: Any, stage: Any, scene: LoadedScene, frames: int) -> None:
     attributes = {name: prim.CreateAttribute(name, getattr(types, kind), custom=False) for name, kind in _TYPES.items()}
     factors = plain_factors(scene).astype(np.float32)
     last: dict[str, tuple[int, Floats]] = {}  # what was written, and for which frame
-    with Progress(frames, "frames") as progress:
-        for number, t in enumerate(np.linspace(0, 1, frames).tolist()):
-            for name, values in _values(scene, t, factors).items():
-                if name == "orientations" and name in last:  # -q turns as q does, but not what lies between frames
-                    values[(values * last[name][1]).sum(axis=1) < 0] *= -1
-                if name in last and np.array_equal(values, last[name][1]):
-                    continue
-                if name in last and last[name][0] < number - 1:
-                    attributes[name].Set(_vt(pxr, name, last[name][1]), number - 1)
-                value = _vt(pxr, name, values)
-                if name not in last:
-                    attributes[name].Set(value)  # for programs that ask for no time
-                attributes[name].Set(value, number)
-                last[name] = number, values
-            progress.step()
+    for number, t in enumerate(counted(np.linspace(0, 1, frames).tolist(), frames, "frames")):
+        for name, values in _values(scene, t, factors).items():
+            if name == "orientations" and name in last:  # -q turns as q does, but not what lies between frames
+                values[(values * last[name][1]).sum(axis=1) < 0] *= -1
+            if name in last and np.array_equal(values, last[name][1]):
+                continue
+            if name in last and last[name][0] < number - 1:
+                attributes[name].Set(_vt(pxr, name, last[name][1]), number - 1)
+            value = _vt(pxr, name, values)
+            if name not in last:
+                attributes[name].Set(value)  # for programs that ask for no time
+            attributes[name].Set(value, number)
+            last[name] = number, values
 
 
 def _values(scene: LoadedScene, t: float, factors: Floats) -> dict[str, Floats]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError, optional_module
 from lapgs_wgpu.io.atomic import atomic_write
-from lapgs_wgpu.progress import Progress
+from lapgs_wgpu.progress import counted
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.viewer.camera import ViewCamera
 
@@ -73,7 +73,6 @@ def write_video(
     rate = Fraction(fps).limit_denominator(65535)
     with (
         atomic_write(file) as target,
-        Progress(frames, "frames") as progress,
         av.open(f"file:{target.name}", "w", format="mp4") as container,
     ):
         stream = container.add_stream("libx264", rate, options={"crf": _QUALITY, "preset": "medium"})
@@ -82,10 +81,9 @@ def write_video(
         # swscale converts, and sRGB's primaries.
         context = stream.codec_context
         context.colorspace, context.color_primaries, context.color_trc, context.color_range = 6, 1, 13, 1
-        for camera, time in cameras:
+        for camera, time in counted(cameras, frames, "frames"):
             image = render(camera, time)
             if not context.is_open:  # the first encoded frame opens it
                 stream.height, stream.width = image.shape[:2]
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, "rgb24")))
-            progress.step()
         container.mux(stream.encode(None))

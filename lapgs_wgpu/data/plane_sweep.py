@@ -22,7 +22,7 @@ from scipy.sparse.linalg import spsolve
 
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.views import Dataset, small_views
-from lapgs_wgpu.progress import Progress, say
+from lapgs_wgpu.progress import counted, say
 from lapgs_wgpu.splat.camera import Camera
 
 Array = NDArray[np.float64]
@@ -118,11 +118,9 @@ def _surfaces(stills: list[_Still], bounds: tuple[float, float]) -> list[tuple[P
     """
     near, far = bounds
     planes = np.linspace(1 / far, 1 / near, DEPTHS)
-    maps = []
-    with Progress(len(stills), "cameras searched for surfaces") as progress, ThreadPoolExecutor() as threads:
-        for depths in threads.map(partial(_sweep, stills=stills, planes=planes, least=BASELINE * near), stills):
-            maps.append(depths)
-            progress.step()
+    with ThreadPoolExecutor() as threads:
+        swept = threads.map(partial(_sweep, stills=stills, planes=planes, least=BASELINE * near), stills)
+        maps = list(counted(swept, len(stills), "cameras searched for surfaces"))
     tolerance = NEAR * (planes[1] - planes[0])
     found = _confirmed(stills, maps, tolerance)
     known = [np.where(kept, depths, np.nan) for kept, depths in zip(found, maps, strict=True)]

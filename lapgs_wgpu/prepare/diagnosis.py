@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import warnings
 from collections.abc import Sequence
@@ -21,7 +22,7 @@ from lapgs_wgpu.data.readers.colmap import IMAGES
 from lapgs_wgpu.prepare.capture_folder import MASKS
 from lapgs_wgpu.prepare.path import AROUND, STEP, TURN, path_faults
 from lapgs_wgpu.prepare.poses import Floats
-from lapgs_wgpu.progress import Progress
+from lapgs_wgpu.progress import counted
 from lapgs_wgpu.splat.camera import Camera
 
 SIZE = 320  # longer side of the images that are looked at, pixels
@@ -110,17 +111,16 @@ def _looks(folder: Path, views: Sequence[View], cameras: Sequence[Camera] | None
     groups = [views] if cameras is None else [[view for view in views if view.camera is camera] for camera in cameras]
     chosen = [evenly(group, max(3, MOST_VIEWS // len(groups))) for group in groups]
     looks: list[Look] = []
-    with ThreadPoolExecutor(4) as pool, Progress(sum(map(len, chosen)), "images looked at") as progress:
-        for group in chosen:
-            images = []
-            for image in pool.map(lambda view: view.load()[..., :3], group):
-                images.append(image)
-                progress.step()
-            masks: list[Mask | None] = [_mask(folder, view) for view in group]
-            if cameras is not None:
-                levels = np.stack([_gray(image) for image in images])
-                masks = list(np.abs(levels - np.median(levels, axis=0)) > LEVELS)
-            looks += map(Look, group, images, masks)
+    with ThreadPoolExecutor(4) as pool:
+        loaded = pool.map(lambda view: view.load()[..., :3], itertools.chain(*chosen))
+        rest = list(counted(loaded, sum(map(len, chosen)), "images looked at"))
+    for group in chosen:
+        images, rest = rest[: len(group)], rest[len(group) :]
+        masks: list[Mask | None] = [_mask(folder, view) for view in group]
+        if cameras is not None:
+            levels = np.stack([_gray(image) for image in images])
+            masks = list(np.abs(levels - np.median(levels, axis=0)) > LEVELS)
+        looks += map(Look, group, images, masks)
     return looks
 
 

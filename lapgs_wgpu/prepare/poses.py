@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.errors import optional_module
-from lapgs_wgpu.progress import Progress
+from lapgs_wgpu.progress import counted
 
 FEATURE_SIDE = 1600  # longer side, pixels: larger images are shrunk to find features
 MOST_FEATURES = 2000  # of an image, the strongest; the time of matching grows with their square
@@ -60,20 +60,16 @@ class Reconstruction:
     def find_features(self) -> dict[str, Plane]:
         """Find the features of all images, whose places are kept; returns their descriptors (`sift`)."""
         found = {}
-        with Progress(len(self.names), "images searched for features") as progress, self.database() as database:
-            for name in self.names:
+        with self.database() as database:
+            for name in counted(self.names, len(self.names), "images searched for features"):
                 self.places[name], found[name] = sift(self.images / name)
                 database.write_keypoints(self.ids[name], self.places[name])
-                progress.step()
         return found
 
     def match(self, pairs: Sequence[Pair], descriptors: Mapping[str, Plane]) -> dict[Pair, Ints]:
         """Match the features of pairs of images, and verify the matches."""
-        matches = {}
-        with Progress(len(pairs), "pairs of images matched") as progress:
-            for one, other in pairs:
-                matches[one, other] = nearest(descriptors[one], descriptors[other])
-                progress.step()
+        numbered = counted(pairs, len(pairs), "pairs of images matched")
+        matches = {(one, other): nearest(descriptors[one], descriptors[other]) for one, other in numbered}
         self.use(matches)
         return matches
 
