@@ -33,7 +33,6 @@ ALLOWED = {
         "io.safe_json_toml",
         "io.dataclass_table",
         "io.ply_elements",
-        "io.ply_colors",
     },
     "io": {"errors", "splat.camera"},
     "train": {"errors", "progress", "stop_signals", "gpu", "splat", "motion", "data", "io"},

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.io.ply_colors import read_colors
-from lapgs_wgpu.io.ply_elements import BAD_SHARE, Floats, open_ply
+from lapgs_wgpu.io.ply_elements import BAD_SHARE, Floats, open_ply, read_colors
 from lapgs_wgpu.splat.camera import Camera
 
 Array = NDArray[np.float64]

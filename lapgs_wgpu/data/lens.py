@@ -115,7 +115,8 @@ class Lens:
 
 
 class Undistortion(NamedTuple):
-    """Resamples images of `lens` (at their size) to those of a pinhole camera with intrinsics K (3, 3)."""
+    """Resamples images of `lens` (at their size) to those of a pinhole camera with intrinsics K (3, 3); those of a
+    pinhole stay as they are."""
 
     lens: Lens
     K: Array
@@ -125,6 +126,8 @@ class Undistortion(NamedTuple):
 
         Colors weigh by their alpha, so that those of transparent pixels do not bleed into edges.
         """
+        if self.lens.is_pinhole:
+            return image
         from scipy.ndimage import map_coordinates  # takes most of a second to import
 
         height, width = image.shape[:2]

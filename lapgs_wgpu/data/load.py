@@ -216,38 +216,35 @@ def _check_masks(frames: Sequence[Frame]) -> list[str]:
     return warnings + check_masks(moving, size, "white", movers=True)
 
 
-def _cameras(capture: Capture, size: Size) -> tuple[list[Camera], dict[Lens, Undistortion | None]]:
+def _cameras(capture: Capture, size: Size) -> tuple[list[Camera], dict[Lens, Undistortion]]:
     """Return the pinhole camera of each frame for images of `size`, (width, height), and how the images of each lens
-    are undistorted at their own size; None for a pinhole. Raises InputError.
+    are undistorted at their own size. Raises InputError.
 
     Frames of equal lens and pose share the camera if the capture says so.
     """
     stored = capture.frames[0].image.size
-    undistortions: dict[Lens, Undistortion | None] = {}
+    undistortions: dict[Lens, Undistortion] = {}
     made: dict[tuple[Lens, bytes] | int, Camera] = {}
     cameras = []
     for index, frame in enumerate(capture.frames):
         lens = frame.lens
         if lens not in undistortions:
             resized = lens.resized(*stored)
-            undistortions[lens] = None if lens.is_pinhole else Undistortion(resized, resized.pinhole(frame.where))
-        undistortion = undistortions[lens]
+            undistortions[lens] = Undistortion(resized, resized.pinhole(frame.where))
         key = (lens, frame.T_cam_world.tobytes()) if capture.shares_cameras else index
         if key not in made:
-            K, taken = (lens.K, (lens.width, lens.height)) if undistortion is None else (undistortion.K, stored)
+            K, taken = (lens.K, (lens.width, lens.height)) if lens.is_pinhole else (undistortions[lens].K, stored)
             made[key] = Camera(K, frame.T_cam_world, *taken).resized(*size)
         cameras.append(made[key])
     return cameras, undistortions
 
 
-def _view(frame: Frame, number: int, camera: Camera, undistortion: Undistortion | None) -> View:
+def _view(frame: Frame, number: int, camera: Camera, undistortion: Undistortion) -> View:
     """Make the view of a frame. number: within its split, for its name. camera: in the world's coordinates."""
     assert frame.time is not None
     stored, size = frame.image.size, (camera.width, camera.height)
 
     def pixels() -> Pixels:
-        if undistortion is None:
-            return frame.image.read(size)
         return shrink(undistortion.apply(frame.image.read(stored)), size)
 
     def mask(path: Path | None, kind: MaskKind, above: int = 0) -> Callable[[], Mask] | None:

@@ -90,16 +90,14 @@ def check_masks(masks: Mapping[str, Path], size: Size, kind: MaskKind, *, movers
     )
 
 
-def read_mask(
-    path: Path, kind: MaskKind, undistortion: Undistortion | None, stored: Size, size: Size, above: int = 0
-) -> Mask:
+def read_mask(path: Path, kind: MaskKind, undistortion: Undistortion, stored: Size, size: Size, above: int = 0) -> Mask:
     """Decode the mask (H, W) of an image of (width, height) `stored` that is undistorted and shrunk to `size`.
 
     The mask is first resized to `stored` by nearest neighbours. A pixel in which several mix is set if any of them is;
     `above` as in `MOSTLY`. Raises InputError.
     """
     pixels = resize(as_pixels(decode_mask(path, kind)), stored, NEAREST)
-    return shrink(pixels if undistortion is None else undistortion.apply(pixels), size)[..., 0] > above
+    return shrink(undistortion.apply(pixels), size)[..., 0] > above
 
 
 def decode_mask(path: Path, kind: MaskKind = "white") -> Mask:

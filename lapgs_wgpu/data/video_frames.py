@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
@@ -24,6 +26,7 @@ from lapgs_wgpu.io.atomic import new_folder
 EXACT_COLORS = 0x4 | 0x40000 | 0x2000
 COMPRESSION = 1  # of PNG: the next levels take twice as long for a tenth of the bytes
 LARGEST_FRAME = 8192 * 8192  # pixels; the decoder holds several frames
+_ATTACHED_PICTURE = 0x400  # libavformat's flag of a cover image
 WIDEST = 4.0  # width by height of a pixel, or height by width; what a header states beyond it is no such ratio
 WRITERS = min(8, os.cpu_count() or 1)  # threads that shrink and write the frames of the video that is being unpacked
 INTERLACED = (
@@ -58,28 +61,15 @@ def _check_header(path: Path) -> tuple[Display, Size]:
 
     Raises InputError for what is no film, and for frames that are too large, too many, or not of square pixels.
     """
-    av = import_av(path)
-    try:
-        with av.open(str(path), metadata_errors="replace") as file:
-            if not file.streams.video:
-                raise InputError(f"{path} has no video stream; give the camera's recording.")
-            stream = file.streams.video[0]
-            if stream.codec_context is None:
-                raise InputError(f"{path} is in a format that PyAV cannot decode; record or convert it to H.264.")
-            what, bytes_ = f"{path} has frames of {stream.width}x{stream.height} pixels", path.stat().st_size
-            if stream.width * stream.height > LARGEST_FRAME:
-                raise InputError(f"{what}, and at most {LARGEST_FRAME:,} pixels a frame are allowed; shrink it.")
-            if stream.frames > bytes_:
-                raise InputError(f"{path} has {stream.frames} frames, it states, in {bytes_} bytes; copy it again.")
-            if abs(pixel_aspect(stream) - 1) > 0.01:
-                raise InputError(
-                    f"{what}, each {pixel_aspect(stream):.3g} times as wide as high; convert it to square pixels, "
-                    "which the one focal length of its camera is for."
-                )
-            stream.codec_context.options = {"max_pixels": str(LARGEST_FRAME)}  # whatever the header states
-            first = next(file.decode(stream), None)
-    except (av.error.FFmpegError, OSError) as error:
-        raise InputError(f"{path} is not a readable video ({error}); copy or record it again.") from None
+    with opened_film(path) as (file, stream):
+        if stream.frames > (size := path.stat().st_size):
+            raise InputError(f"{path} has {stream.frames} frames, it states, in {size} bytes; copy it again.")
+        if abs(pixel_aspect(stream) - 1) > 0.01:
+            raise InputError(
+                f"{path} has frames of {stream.width}x{stream.height} pixels, each {pixel_aspect(stream):.3g} times as "
+                "wide as high; convert it to square pixels, which the one focal length of its camera is for."
+            )
+        first = next(file.decode(stream), None)
     if first is None:
         raise InputError(f"{path} has no frame that can be decoded; copy or record it again.")
     if first.interlaced_frame:
@@ -90,37 +80,56 @@ def _check_header(path: Path) -> tuple[Display, Size]:
 
 def _unpack(path: Path, folder: Path, shape: Display, size: Size, wanted: Size) -> None:
     """Write every frame, of (width, height) `size`, as PNG of the wanted size into a new folder. Raises InputError."""
-    av = import_av(path)
     print(f"{path}: its frames are unpacked once, into {folder}", file=sys.stderr, flush=True)
     written, declared = list[Future[None]](), 0
     room = f"{wanted[0] * wanted[1] * 1.5e-6:.1f} MB a frame"
+    with (
+        new_folder(folder, f"make room there, {room}, or set XDG_CACHE_HOME to another folder") as unfinished,
+        ThreadPoolExecutor(WRITERS, thread_name_prefix="unpack") as pool,
+        opened_film(path) as (file, stream),
+    ):
+        for packet in file.demux(stream):
+            declared += packet.size > 0 and not packet.is_discard
+            for frame in packet.decode():
+                image = shape.apply(frame.to_ndarray(format="rgb24", interpolation=EXACT_COLORS))
+                if image.shape[1::-1] != size:
+                    raise InputError(
+                        f"{path}: frame {len(written)} has {size_text(image.shape[1::-1])} pixels, and the first "
+                        f"has {size_text(size)}; convert it to one size."
+                    )
+                if len(written) >= 2 * WRITERS:  # the decoder is ahead: bound the frames in memory
+                    written[-2 * WRITERS].result()
+                written.append(pool.submit(_write, image, wanted, unfinished / f"{len(written):05d}.png"))
+        for pending in written:
+            pending.result()
+        if len(written) != declared:
+            raise InputError(f"{path} has {declared} frames, and {len(written)} can be decoded; copy it again.")
+
+
+@contextmanager
+def opened_film(path: Path) -> Iterator[tuple[Any, Any]]:
+    """PyAV's file and the film among its streams: the largest one that is no cover picture. Raises InputError for what
+    cannot be decoded, and for frames that are too large."""
+    av = import_av(path)
     try:
-        with (
-            new_folder(folder, f"make room there, {room}, or set XDG_CACHE_HOME to another folder") as unfinished,
-            ThreadPoolExecutor(WRITERS, thread_name_prefix="unpack") as pool,
-            av.open(str(path), metadata_errors="replace") as file,
-        ):
-            stream = file.streams.video[0]
+        with av.open(str(path), metadata_errors="replace") as file:
+            streams = [each for each in file.streams.video if not int(each.disposition) & _ATTACHED_PICTURE]
+            if not streams:
+                raise InputError(f"{path} has no video stream; give the camera's recording.")
+            decoded = [each for each in streams if each.codec_context is not None]
+            if not decoded:
+                raise InputError(f"{path} is in a format that PyAV cannot decode; convert it to H.264.")
+            stream = max(decoded, key=lambda each: (each.width or 0) * (each.height or 0))
+            if not 1 <= stream.width * stream.height <= LARGEST_FRAME:
+                raise InputError(
+                    f"{path} states frames of {stream.width}x{stream.height} pixels; 1 to {LARGEST_FRAME:,} pixels a "
+                    "frame are allowed."
+                )
             stream.thread_type = "AUTO"
-            stream.codec_context.options = {"max_pixels": str(LARGEST_FRAME)}
-            for packet in file.demux(stream):
-                declared += packet.size > 0 and not packet.is_discard
-                for frame in packet.decode():
-                    image = shape.apply(frame.to_ndarray(format="rgb24", interpolation=EXACT_COLORS))
-                    if image.shape[1::-1] != size:
-                        raise InputError(
-                            f"{path}: frame {len(written)} has {size_text(image.shape[1::-1])} pixels, and the first "
-                            f"has {size_text(size)}; convert it to one size."
-                        )
-                    if len(written) >= 2 * WRITERS:  # the decoder is ahead: bound the frames in memory
-                        written[-2 * WRITERS].result()
-                    written.append(pool.submit(_write, image, wanted, unfinished / f"{len(written):05d}.png"))
-            for pending in written:
-                pending.result()
-            if len(written) != declared:
-                raise InputError(f"{path} has {declared} frames, and {len(written)} can be decoded; copy it again.")
+            stream.codec_context.options = {"max_pixels": str(LARGEST_FRAME)}  # whatever the header states
+            yield file, stream
     except av.error.FFmpegError as error:
-        raise InputError(f"{path} cannot be decoded ({error}); copy or record it again.") from None
+        raise InputError(f"{path} cannot be decoded as a film ({error}); copy or record it again.") from None
 
 
 class Display(NamedTuple):

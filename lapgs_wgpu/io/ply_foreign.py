@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.ply import MAX_LOG_SCALE, GaussianSnapshot, gaussian_names, snapshot_of, vertex_of
-from lapgs_wgpu.io.ply_colors import SH_C0, read_colors
-from lapgs_wgpu.io.ply_elements import BAD_SHARE, Element, Floats, PathLike, PlyFile
+from lapgs_wgpu.io.ply_elements import BAD_SHARE, SH_C0, Element, Floats, PathLike, PlyFile, read_colors
 
 _MOTION = re.compile(  # words of a property's name that speak of time or of motion
     "(.*_)?(trbf|motion|omega|velocity|vel|v[xyz]|rot_r|t|time|timestamp|duration|lifetime|poly|fourier|traj|deform|temporal)"

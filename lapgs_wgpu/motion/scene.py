@@ -16,10 +16,10 @@ from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.checkpoint import write_checkpoint
 from lapgs_wgpu.io.ply import GaussianSnapshot
 from lapgs_wgpu.motion.fields.config import MIN_SCALE, FieldConfig
-from lapgs_wgpu.motion.fields.deformation import Deformation, Deformed, Nearby, TimeSamples
+from lapgs_wgpu.motion.fields.deformation import Deformation, Deformed, Field, Nearby, TimeSamples
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion
-from lapgs_wgpu.motion.fields.make_field import Field, check_own, make_field
+from lapgs_wgpu.motion.fields.make_field import check_own, make_field
 from lapgs_wgpu.motion.scene_file import SceneFile, read_scene, row_shapes, scene_header
 from lapgs_wgpu.motion.timing import EVEN, Timing
 from lapgs_wgpu.splat.camera import Camera
@@ -195,7 +195,7 @@ class Scene4D:
         canonical = self.canonical()
         if self.field is None or len(self) == 0:
             return Deformed(canonical, None, [])
-        move, *others = self._moves(t, nearby, time_samples)
+        move, *others = self.field.at_times(p["means"], t, p.get("dynamics"), nearby, time_samples)
         quats, sh, opacities = canonical.quats, canonical.sh, canonical.opacities
         if move.orientation is not None:
             quats = quat_multiply(move.orientation, quats)
@@ -212,17 +212,6 @@ class Scene4D:
             at_times = [self._moved(other, *rows) for other in others]
         gaussians = Gaussians(means, quats, scales, opacities, sh, antialiased=self.antialiased)
         return Deformed(gaussians, move.smoothness, at_times)
-
-    def _moves(self, t: float, nearby: Nearby | None, time_samples: TimeSamples | None) -> list[Deformation]:
-        field, means, dynamics = self.field, self.parameters["means"], self.parameters.get("dynamics")
-        assert field is not None
-        if isinstance(field, GridField):
-            return field.at_times(means, t, dynamics, nearby, time_samples)
-        move = field(means, t, dynamics, nearby)
-        if time_samples is None:
-            return [move]
-        rows = time_samples.chosen(means, dynamics)
-        return [move, *(field(rows[0], time, rows[1]) for time in time_samples.times)]
 
     def _moved(self, move: Deformation, means: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
         if move.d_scales is not None:

@@ -15,17 +15,16 @@ from lapgs_wgpu.data.thumbnails import THUMBNAIL
 from lapgs_wgpu.data.video_frames import (
     EXACT_COLORS,
     INTERLACED,
-    LARGEST_FRAME,
     Display,
     display,
     import_av,
+    opened_film,
     pixel_aspect,
 )
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.hdr import to_sdr, transfer_of
 
 _FAST_BILINEAR = 0x1  # of swscale: exact enough for a thumbnail
-_ATTACHED_PICTURE = 0x400  # libavformat's flag of a cover image
 
 
 class Frame(NamedTuple):
@@ -67,35 +66,21 @@ class Film:
         self.notes: list[str] = []
         if not path.is_file():
             raise InputError(f"{path} does not exist; check its name, and the folder {path.parent.resolve()}.")
-        av = import_av(path)
-        try:
-            with av.open(str(path), metadata_errors="replace") as file:
-                stream = self._stream(file)
-                if stream.codec_context is None:
-                    raise InputError(f"{path} is in a format that PyAV cannot decode; convert it to H.264.")
-                coded = (int(stream.width), int(stream.height))
-                self._aspect = pixel_aspect(stream)
-                length = stream.duration and stream.time_base and stream.duration * stream.time_base
-                self.seconds = float(length or (file.duration or 0) / 1e6)  # of the container: microseconds
-                self.rate = float(stream.average_rate or stream.guessed_rate or 30.0)
-        except (av.error.FFmpegError, OSError) as error:
-            raise InputError(f"{path} is not a readable film ({error}); copy or record it again.") from None
-        if min(coded) < 1 or coded[0] * coded[1] > LARGEST_FRAME:
-            raise InputError(
-                f"{path} states frames of {size_text(coded)} pixels; 1 to {LARGEST_FRAME:,} pixels a frame are allowed."
-            )
-        self.size: Size = _squared(coded, self._aspect)  # turned by `frames` where the first frame says so
+        with opened_film(path) as (file, stream):
+            self._aspect = pixel_aspect(stream)
+            length = stream.duration and stream.time_base and stream.duration * stream.time_base
+            self.seconds = float(length or (file.duration or 0) / 1e6)  # of the container: microseconds
+            self.rate = float(stream.average_rate or stream.guessed_rate or 30.0)
+            # Turned by `frames` where the first frame says so.
+            self.size: Size = _squared((stream.width, stream.height), self._aspect)
 
     def frames(self) -> Iterator[Frame]:
         """Decode the frames in the order of their times. Raises InputError; a film that is damaged after its first
         frames ends there, with a note."""
         av = import_av(self.path)
         number, first, last, guessed, rate, begin = 0, 0.0, -1.0, False, self.rate, None
-        try:
-            with av.open(str(self.path), metadata_errors="replace") as file:
-                stream = self._stream(file)
-                stream.thread_type = "AUTO"
-                stream.codec_context.options = {"max_pixels": str(LARGEST_FRAME)}  # whatever the header states
+        with opened_film(self.path) as (file, stream):
+            try:
                 for frame in file.decode(stream):
                     shape = display(frame)
                     shown = _squared((frame.width, frame.height), self._aspect)
@@ -117,12 +102,13 @@ class Film:
                         begin = seconds if begin is None else begin
                         yield Frame(seconds - begin, _gray(frame, shown, shape), partial(_pixels, frame, shown, shape))
                     number, last = number + 1, seconds
-        except (av.error.FFmpegError, OSError) as error:
-            if number < 2:
-                raise InputError(f"{self.path} cannot be decoded ({error}); copy or record it again.") from None
-            self.notes.append(
-                f"{self.path} is damaged after {number} frames, at {last:.2f} s ({error}); what comes before is used."
-            )
+            except av.error.FFmpegError as error:
+                if number < 2:
+                    raise
+                self.notes.append(
+                    f"{self.path} is damaged after {number} frames, at {last:.2f} s ({error}); what comes before is "
+                    "used."
+                )
         if number < 2:
             raise InputError(
                 f"{self.path} has {number} frames that can be decoded, and 2 are needed at least; give the recording "
@@ -138,13 +124,6 @@ class Film:
                 f"{self.path}: frames without a time stamp of their own are taken as {rate:g} a second; the motion is "
                 "too fast or too slow if that is wrong."
             )
-
-    def _stream(self, file: Any) -> Any:
-        """The film among the streams: the largest one that is no cover picture."""
-        streams = [s for s in file.streams.video if not int(s.disposition) & _ATTACHED_PICTURE]
-        if not streams:
-            raise InputError(f"{self.path} has no video stream; give the camera's recording.")
-        return max(streams, key=lambda s: (s.width or 0) * (s.height or 0))
 
 
 def _squared(coded: Size, aspect: float) -> Size:

@@ -20,7 +20,7 @@ from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.laplacian import VARIANCE_FLOOR, VARIANCE_SPREAD
 from lapgs_wgpu.motion.passes.activation_passes import GEOMETRY_FLOATS, SH_FLOATS
-from lapgs_wgpu.motion.passes.field_weights import ALIGNED, FieldWeights
+from lapgs_wgpu.motion.passes.decoder_passes import ALIGNED, FieldWeights
 from lapgs_wgpu.motion.passes.grid_field_passes import FieldArrays
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.learners import Learners

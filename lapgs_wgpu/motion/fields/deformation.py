@@ -1,16 +1,15 @@
 """The interface of all deformation fields.
 
-A field is an nn.Module with the call field(means, t, dynamics, nearby) -> Deformation. means: (N, 3) canonical, world
+A field is a `Field` with the call field(means, t, dynamics, nearby) -> Deformation. means: (N, 3) canonical, world
 units; the field gives them no gradient. t: in [0, 1]. dynamics: (N, D) or None. nearby: a Nearby or None.
-A new field is the identity. parameter_groups() returns its parameters by learning rate: "hash" (tables and planes) and
-"mlp". `OwnField` makes a field of any nn.Module.
+A new field is the identity. `OwnField` makes a field of any nn.Module.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-from torch import Tensor
+from torch import Tensor, nn
 
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rotation import rotate
@@ -39,6 +38,29 @@ class TimeSamples(NamedTuple):
     def chosen(self, means: Tensor, dynamics: Tensor | None) -> tuple[Tensor, Tensor | None]:
         """The rows of all Gaussians' means (N, 3) and dynamics attributes (N, D)."""
         return means[self.rows], None if dynamics is None else dynamics[self.rows]
+
+
+class Field(nn.Module):
+    """Base class of fields."""
+
+    def at_times(
+        self,
+        means: Tensor,
+        t: float,
+        dynamics: Tensor | None = None,
+        nearby: Nearby | None = None,
+        time_samples: TimeSamples | None = None,
+    ) -> list[Deformation]:
+        """Return the deformation at time t as `forward` does, and that of `time_samples` at each of its times."""
+        moves = [self(means, t, dynamics, nearby)]
+        if time_samples is not None:
+            rows, their_dynamics = time_samples.chosen(means, dynamics)
+            moves += [self(rows, time, their_dynamics) for time in time_samples.times]
+        return moves
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Return the parameters by learning rate: "hash" (tables and planes) and "mlp"."""
+        return {"mlp": list(self.parameters())}
 
 
 class Deformation(NamedTuple):

@@ -10,7 +10,7 @@ from torch.utils.checkpoint import checkpoint
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import GEOMETRY, TEMPORAL_AXES, FieldConfig
-from lapgs_wgpu.motion.fields.deformation import Deformation, Nearby, TimeSamples
+from lapgs_wgpu.motion.fields.deformation import Deformation, Field, Nearby, TimeSamples
 from lapgs_wgpu.motion.fields.hash_encoder import HashEncoder, HashGrid
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion, TimeMotion
 from lapgs_wgpu.motion.fields.layers import linear, zero_head
@@ -20,7 +20,7 @@ from lapgs_wgpu.motion.fields.torch_decoder import KEPT, DecoderWeights, decode
 _BLOCK = 1 << 13  # Gaussians per block decoded by hidden layers
 
 
-class GridField(nn.Module):
+class GridField(Field):
     """grid4d: temporal hash features, gated by spatial ones, then linear heads (Grid4D, Xu et al. 2024; paper eq. 9).
 
     laplacian: concatenates each Gaussian's dynamics attribute with its temporal features (eq. 8), adds the Laplacian
@@ -73,10 +73,7 @@ class GridField(nn.Module):
         nearby: Nearby | None = None,
         time_samples: TimeSamples | None = None,
     ) -> list[Deformation]:
-        """Return the deformation at time t as `forward` does, and that of `time_samples` at each of its times.
-
-        All are encoded together, which takes much less time than one after another.
-        """
+        """See motion/fields/deformation.py. All are encoded together, which takes much less time than apart."""
         now, *others, sq_distances = self._outputs(means, t, dynamics, nearby, time_samples)
         smoothness = _smoothness(sq_distances, nearby) if nearby is not None else None
         return [self._deformation(now)._replace(smoothness=smoothness), *map(self._deformation, others)]

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from lapgs_wgpu.motion.fields.config import HEXPLANE_HEADS, PLANES, FieldConfig
-from lapgs_wgpu.motion.fields.deformation import Deformation, Nearby
+from lapgs_wgpu.motion.fields.deformation import Deformation, Field, Nearby
 from lapgs_wgpu.motion.fields.hash_grid_config import TIME
 from lapgs_wgpu.motion.fields.layers import linear, zero_head
 from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
@@ -15,7 +15,7 @@ from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
 SPACE_SMOOTHNESS, TIME_SMOOTHNESS, TIME_SPARSITY = 1e-4, 1e-2, 1e-4
 
 
-class HexPlaneField(nn.Module):
+class HexPlaneField(Field):
     """Features are products over the six planes, concatenated over the resolutions, and decoded by small MLPs.
 
     Outside the box, features are those of its border.

@@ -7,12 +7,11 @@ from torch import nn
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
+from lapgs_wgpu.motion.fields.deformation import Field
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.fields.hexplane_field import HexPlaneField
 from lapgs_wgpu.motion.fields.mlp_field import MlpField
 from lapgs_wgpu.motion.fields.own_field import OwnField
-
-Field = GridField | MlpField | HexPlaneField | OwnField
 
 
 def make_field(config: FieldConfig, device: Device, seed: int = 0, own: nn.Module | None = None) -> Field | None:

@@ -8,12 +8,12 @@ import torch
 from torch import Tensor, nn
 
 from lapgs_wgpu.motion.fields.config import MLP_LAYERS, MLP_OUTPUTS, MLP_SKIP, PLACE_OCTAVES, TIME_OCTAVES, FieldConfig
-from lapgs_wgpu.motion.fields.deformation import Deformation, Nearby
+from lapgs_wgpu.motion.fields.deformation import Deformation, Field, Nearby
 from lapgs_wgpu.motion.fields.layers import linear, zero_head
 from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
 
 
-class MlpField(nn.Module):
+class MlpField(Field):
     """Eight layers over sines of position and time, whose outputs are added to mean, quaternion and scale."""
 
     def __init__(self, config: FieldConfig, seed: int) -> None:
@@ -38,10 +38,6 @@ class MlpField(nn.Module):
             hidden = torch.relu(layer(torch.cat([inputs, hidden], dim=1) if number == MLP_SKIP else hidden))
         shift, d_quats, d_scales = self.heads(hidden).split(MLP_OUTPUTS, dim=1)
         return Deformation(None, self.unit * shift, d_quats, self.unit * d_scales)
-
-    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """See motion/fields/deformation.py."""
-        return {"mlp": list(self.parameters())}
 
 
 def octaves(values: Tensor, count: int) -> Tensor:

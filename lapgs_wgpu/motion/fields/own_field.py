@@ -8,7 +8,7 @@ from collections import Counter
 from torch import Tensor, nn
 
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.motion.fields.deformation import Deformation, Nearby
+from lapgs_wgpu.motion.fields.deformation import Deformation, Field, Nearby
 
 _ROWS = {
     "rotation": (4,), "orientation": (4,), "translation": (3,), "d_quats": (4,), "d_scales": (3,), "d_dc": (3,),
@@ -16,7 +16,7 @@ _ROWS = {
 }  # fmt: skip
 
 
-class OwnField(nn.Module):
+class OwnField(Field):
     """A deformation field of any module that answers time and means.
 
     module: called as module(means, t), with the arguments dynamics and nearby where its forward names them. It returns

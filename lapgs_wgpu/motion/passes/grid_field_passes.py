@@ -13,8 +13,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.config import FieldConfig, static_grid, temporal_grids
-from lapgs_wgpu.motion.passes.decoder_passes import DecoderPasses
-from lapgs_wgpu.motion.passes.field_weights import FieldWeights, Heads, Time
+from lapgs_wgpu.motion.passes.decoder_passes import DecoderPasses, FieldWeights, Heads, Time
 from lapgs_wgpu.motion.passes.hash_encoder_passes import HashEncoderPasses, PointSet
 from lapgs_wgpu.motion.passes.samples import SamplePasses, Samples, Sampling
 
