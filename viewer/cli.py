@@ -114,6 +114,7 @@ def _screenshot(given: Any, scene: LoadedScene) -> None:
 def _video(given: Any, scene: LoadedScene) -> None:
     import numpy as np
 
+    from lapgs_wgpu.data.images import size_text
     from lapgs_wgpu.viewer import video
     from lapgs_wgpu.viewer.camera import ViewCamera
     from lapgs_wgpu.viewer.offscreen import framed
@@ -129,7 +130,7 @@ def _video(given: Any, scene: LoadedScene) -> None:
     wanted = given.size or ((view.camera.width, view.camera.height) if view else _SIZE)
     size = video.even(wanted)
     if size != wanted:
-        print(f"note: mp4 needs even sizes: {_by(wanted)} becomes {_by(size)}", file=sys.stderr)
+        print(f"note: mp4 needs even sizes: {size_text(wanted)} becomes {size_text(size)}", file=sys.stderr)
     frames = video.count_frames(given.seconds or seconds, fps)
 
     if path == "time":
@@ -144,7 +145,7 @@ def _video(given: Any, scene: LoadedScene) -> None:
             time = given.time
         cameras = video.orbit_views(start, size, frames, None if path == "both" else time, arc)
     video.write_video(file, cameras, frames, fps, _renderer(given, scene))
-    print(f"{file}: {frames} frames of {_by(size)} at {fps:g} a second")
+    print(f"{file}: {frames} frames of {size_text(size)} at {fps:g} a second")
 
 
 def _export(given: Any, scene: LoadedScene) -> None:
@@ -193,10 +194,6 @@ def _named(name: str, ending: str, option: str) -> Path:
     if not name.lower().endswith(ending):
         raise InputError(f"{option} {name}: expected a name that ends with {ending}.")
     return Path(name)
-
-
-def _by(size: tuple[int, int]) -> str:
-    return f"{size[0]}x{size[1]}"
 
 
 if __name__ == "__main__":

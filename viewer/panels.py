@@ -9,7 +9,7 @@ from imgui_bundle import imgui
 from wgpu.utils.imgui import ImguiRenderer
 
 from lapgs_wgpu.viewer.clock import LOOPS, SPEEDS
-from lapgs_wgpu.viewer.key_bindings import KEYS, MOUSE
+from lapgs_wgpu.viewer.controls import KEYS, MOUSE
 from lapgs_wgpu.viewer.present import HEAT
 from lapgs_wgpu.viewer.render_modes import BACKGROUNDS, MODES
 from lapgs_wgpu.viewer.view_state import TrainingControl, ViewState

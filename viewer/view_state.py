@@ -36,7 +36,7 @@ class TrainingControl:
 
 
 class ViewState:
-    """Panels read and set the attributes; keys call the methods and turn the flags (viewer/key_bindings). Knows no
+    """Panels read and set the attributes; keys call the methods and turn the flags (viewer/controls). Knows no
     window and no GUI.
 
     view: number of the capture's camera that was chosen last, or None. training: the training under way; None where a
@@ -67,7 +67,7 @@ class ViewState:
         self.clock.playing = False
         self.clock.seek(self.views[view].time)
 
-    # Actions of keys (viewer/key_bindings), which also turn the flags ------------------------------------------------
+    # Actions of keys (viewer/controls), which also turn the flags ------------------------------------------------
 
     def toggle_playing(self) -> None:
         if self.scene.playback.moves:

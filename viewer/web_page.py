@@ -20,8 +20,7 @@ from lapgs_wgpu.motion.fields.config import MIN_SCALE
 from lapgs_wgpu.splat.drawing import sh_defines
 from lapgs_wgpu.splat.raster_config import gpu_config
 from lapgs_wgpu.viewer.clock import LOOPS, SPEEDS
-from lapgs_wgpu.viewer.controls import ORBIT, ZOOM
-from lapgs_wgpu.viewer.key_bindings import KEYS, MOUSE, KeyBinding
+from lapgs_wgpu.viewer.controls import KEYS, MOUSE, ORBIT, ZOOM, KeyBinding
 from lapgs_wgpu.viewer.render_modes import BACKGROUNDS
 from lapgs_wgpu.viewer.viewport import SETTLED, SMALLEST_SCALE, TARGET_SECONDS
 

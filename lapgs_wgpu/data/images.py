@@ -40,6 +40,11 @@ _SIGNATURES = (  # bytes, their place, and the format
 _ORIENTATION = 0x0112  # EXIF's tag
 SIDEWAYS = 5  # orientations from this one on exchange width and height
 
+THUMBNAIL = 320  # longer side, pixels: what is blurred or equal at this size is so for a training, too
+BLURRED = 0.3  # relative to the sharpness of the images before and after
+AROUND = 5  # number of images before, and after
+EQUAL = 3  # levels of 255: the largest difference of a repeated image, above noise at this size
+
 LANCZOS, NEAREST = Image.Resampling.LANCZOS, Image.Resampling.NEAREST
 
 
@@ -161,6 +166,27 @@ def gray_thumbnail(path: Path, side: int) -> NDArray[np.float32]:
         image = (file if file.mode[0] != "I" else Image.fromarray(decode(path))).convert("L")  # 16 bits of gray
         image.thumbnail((side, side), Image.Resampling.BOX)
         return np.asarray(image, dtype=np.float32)
+
+
+def sharpness(gray: NDArray[np.float32]) -> float:
+    """Variance of the Laplacian of a thumbnail (H, W); 0 where it has no inner pixel."""
+    if min(gray.shape) < 3:
+        return 0.0
+    inner = gray[1:-1, 1:-1]
+    return float((gray[:-2, 1:-1] + gray[2:, 1:-1] + gray[1:-1, :-2] + gray[1:-1, 2:] - 4 * inner).var())
+
+
+def blurred(values: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(N,) whether each image is much less sharp than those around it, by the sharpness of all in the order of time."""
+    if len(values) < 2:
+        return np.zeros(len(values), bool)
+    near = (np.delete(values[max(i - AROUND, 0) : i + AROUND + 1], min(i, AROUND)) for i in range(len(values)))
+    return values < BLURRED * np.array([np.median(around) for around in near])
+
+
+def repeats(gray: NDArray[np.float32], before: NDArray[np.float32]) -> bool:
+    """Whether a thumbnail shows the same as the one before."""
+    return gray.shape == before.shape and bool(np.abs(gray - before).max() <= EQUAL)
 
 
 @contextmanager

@@ -39,8 +39,6 @@ def random_points(n: int, low: float, high: float, seed: int) -> tuple[NDArray[n
 
     All colors are mid-gray, as in 3DGS (except for its noise of 1/255).
     """
-    if n < 1 or not low < high:
-        raise ValueError(f"random_points needs n >= 1 and low < high, got n = {n}, low = {low}, high = {high}")
     means = np.random.default_rng(seed).uniform(low, high, (n, 3)).astype(np.float32)
     return means, np.full((n, 3), 0.5, dtype=np.float32)
 
@@ -51,8 +49,6 @@ def initial_scales(points: NDArray[np.floating]) -> NDArray[np.float32]:
     points: (n, 3), n >= 1. Returns (n,). Up to three points use all their neighbours; a single point gets 1.
     Source: 3DGS (Kerbl et al. 2023), section 5.2, which takes the mean squared distance in its code.
     """
-    if points.ndim != 2 or points.shape[1] != 3 or len(points) < 1:
-        raise ValueError(f"initial_scales needs points of (n, 3) with n >= 1, got {points.shape}")
     if len(points) == 1:
         return np.ones(1, dtype=np.float32)
     tree = cKDTree(points)

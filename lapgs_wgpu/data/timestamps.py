@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Sequence
 from contextlib import suppress
@@ -184,11 +183,6 @@ def disorder(names: Sequence[ImageName], times: Sequence[float], *, numbered: bo
             told = (f"{', '.join(some[:4])}{' ...' * (len(some) > 4)} at {end:g}" for end, some in at.items())
             warnings.append(f"cameras {word} at different times: {', '.join(told)}{advice if numbered else ''}.")
     return warnings
-
-
-def write_times(folder: Path, times: dict[str, float]) -> None:
-    """Write times.json. times: of each image in seconds, by its path below images/."""
-    (folder / TIMES).write_text(json.dumps(times, indent=0) + "\n", encoding="utf-8")
 
 
 def held_out(names: Sequence[ImageName], times: Sequence[float]) -> set[int]:

@@ -18,11 +18,22 @@ from lapgs_wgpu.data.cloud import Cloud, in_view, views_of
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.focus import spread
 from lapgs_wgpu.data.frames import Frame
-from lapgs_wgpu.data.images import ImageFile, Size, decode, gray_thumbnail, size_text
+from lapgs_wgpu.data.images import (
+    BLURRED,
+    EQUAL,
+    THUMBNAIL,
+    ImageFile,
+    Size,
+    blurred,
+    decode,
+    gray_thumbnail,
+    repeats,
+    sharpness,
+    size_text,
+)
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.placement import near_focus
 from lapgs_wgpu.data.poses import AXES_HINT
-from lapgs_wgpu.data.thumbnails import BLURRED, EQUAL, THUMBNAIL, blurred, repeats, sharpness
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera

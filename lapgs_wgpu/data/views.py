@@ -202,8 +202,6 @@ def composite(image: NDArray[np.uint8], background: ArrayLike) -> NDArray[np.uin
     if image.shape[2] == 3:
         return image
     below = np.asarray(background, dtype=np.float32)
-    if below.shape != (3,) or not ((below >= 0) & (below <= 1)).all():
-        raise ValueError(f"background must be three numbers in [0, 1], got {below}")
     alpha = image[..., 3:].astype(np.float32)
     mixed = image[..., :3] * alpha + (255.0 - alpha) * (255.0 * below)
     return np.floor(mixed / 255.0 + 0.5).astype(np.uint8)

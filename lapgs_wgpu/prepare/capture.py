@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +15,7 @@ from lapgs_wgpu.data.images import Size, check_image
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.masks import Mask, check_mask_folder
 from lapgs_wgpu.data.readers.colmap import IMAGES, SPARSE
-from lapgs_wgpu.data.timestamps import write_times
+from lapgs_wgpu.data.timestamps import TIMES
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.calibration import match_names, read_calibration
 from lapgs_wgpu.prepare.capture_folder import MASKS, WORK, RefusedError, appearing
@@ -95,7 +96,8 @@ def prepare(
 
 def write_model(folder: Path, model: Any, pictures: Sequence[Picture]) -> int:
     """Write times.json and a pycolmap.Reconstruction, and return the number of its images."""
-    write_times(folder, {picture.name: picture.seconds for picture in pictures})
+    times = {picture.name: picture.seconds for picture in pictures}
+    (folder / TIMES).write_text(json.dumps(times, indent=0) + "\n", encoding="utf-8")
     (folder / SPARSE / "0").mkdir(parents=True)
     model.write_binary(str(folder / SPARSE / "0"))
     return int(model.num_reg_images())

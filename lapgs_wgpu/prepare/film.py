@@ -10,8 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.images import Pixels, Size, shrunk_size, size_text
-from lapgs_wgpu.data.thumbnails import THUMBNAIL
+from lapgs_wgpu.data.images import THUMBNAIL, Pixels, Size, shrunk_size, size_text
 from lapgs_wgpu.data.video_frames import (
     EXACT_COLORS,
     INTERLACED,

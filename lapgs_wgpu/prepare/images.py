@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lapgs_wgpu.data.evenly import evenly
-from lapgs_wgpu.data.images import Pixels
-from lapgs_wgpu.data.thumbnails import EQUAL, blurred, repeats, sharpness
+from lapgs_wgpu.data.images import EQUAL, Pixels, blurred, repeats, sharpness
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.film import Film, Frame
 from lapgs_wgpu.prepare.poses import import_cv2

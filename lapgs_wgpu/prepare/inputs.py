@@ -15,9 +15,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageOps, UnidentifiedImageError
 
-from lapgs_wgpu.data.images import SUFFIXES, Pixels, check_image, shrink, shrunk_size, size_text
+from lapgs_wgpu.data.images import SUFFIXES, THUMBNAIL, Pixels, check_image, shrink, shrunk_size, size_text
 from lapgs_wgpu.data.stamps import ImageName, natural_key
-from lapgs_wgpu.data.thumbnails import THUMBNAIL
 from lapgs_wgpu.data.timestamps import TIMES, read_times
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.listing import is_desktop_file, listed
