@@ -104,7 +104,7 @@ def test_the_larger_of_two_streams_is_used(tmp_path: Path) -> None:
 
 def test_frames_larger_than_may_be_held(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_film(tmp_path / "film.mp4", noise_pictures(2))
-    monkeypatch.setattr("lapgs_wgpu.prepare.film.LARGEST_FRAME", 64 * 47)
+    monkeypatch.setattr("lapgs_wgpu.data.video_frames.LARGEST_FRAME", 64 * 47)
     with pytest.raises(InputError, match="64x48"):
         Film(path)
 

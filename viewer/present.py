@@ -50,20 +50,14 @@ class Presenter:
         self._source = compose("present", {})
         native = device.wgpu_device
         module = native.create_shader_module(label="present", code=self._source)
-        kinds = ("uniform", "read-only-storage")
-        self._layout = native.create_bind_group_layout(
-            entries=[
-                {"binding": i, "visibility": wgpu.ShaderStage.FRAGMENT, "buffer": {"type": kind}}
-                for i, kind in enumerate(kinds)
-            ]
-        )
         self._pipeline = native.create_render_pipeline(
             label="present",
-            layout=native.create_pipeline_layout(bind_group_layouts=[self._layout]),
+            layout="auto",
             vertex={"module": module, "entry_point": "vertex"},
             fragment={"module": module, "entry_point": "fragment", "targets": [{"format": target_format}]},
             primitive={"topology": "triangle-list"},
         )
+        self._layout = self._pipeline.get_bind_group_layout(0)
 
     def __call__(self, target: Any, size: tuple[int, int], image: DrawnImage) -> None:
         """Submit: the image on all of `target`, a texture view of (width, height)."""

@@ -7,7 +7,6 @@ wgpu-py's own, which keep them alive; errors are raised as wgpu-py raises them.
 from __future__ import annotations
 
 import itertools
-import threading
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -50,18 +49,6 @@ def _mapped(status: int, _message: Any, number: Any, _second: Any) -> None:
     _statuses[int(ffi.cast("uintptr_t", number))] = status
 
 
-class _Callback(threading.local):
-    """Each thread's callback info for a mapping; the library copies it."""
-
-    def __init__(self) -> None:
-        self.info = ffi.new("WGPUBufferMapCallbackInfo *")
-        self.info.mode = lib.WGPUCallbackMode_AllowProcessEvents
-        self.info.callback = _mapped
-
-
-_callback = _Callback()
-
-
 class Mapping:
     """The bytes of a buffer, asked for now, and there once the device has done what uses them.
 
@@ -71,7 +58,8 @@ class Mapping:
 
     def __init__(self, device: Device, buffer: Any, mode: int, offset: int, nbytes: int) -> None:
         self._device, self._buffer, self._place = device, buffer, (offset, nbytes)
-        self._number, info = next(_numbers), _callback.info
+        self._number, info = next(_numbers), ffi.new("WGPUBufferMapCallbackInfo *")  # which the library copies
+        info.mode, info.callback = lib.WGPUCallbackMode_AllowProcessEvents, _mapped
         info.userdata1 = ffi.cast("void *", self._number)
         with raising("wgpuBufferMapAsync"):
             lib.wgpuBufferMapAsync(buffer._internal, mode, offset, nbytes, info[0])

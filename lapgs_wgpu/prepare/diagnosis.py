@@ -80,7 +80,8 @@ class Diagnosis(NamedTuple):
 
     def __str__(self) -> str:
         views = (*self.dataset.train, *self.dataset.test)
-        layout = f"{len(distinct_cameras(views))} cameras that stand still" if self.still else "a camera that moves"
+        cameras = len({view.camera for view in views})
+        layout = f"{cameras} cameras that stand still" if self.still else "a camera that moves"
         understood = [f"capture: {self.dataset.summary}"] if self.dataset.summary else []
         lines = [f"{len(views)} images, {layout}", *understood, *map(str, self.measures)]
         return "\n".join([*lines, *(f" note  {warning}" for warning in self.dataset.warnings)])
@@ -90,7 +91,7 @@ def diagnose(folder: Path) -> Diagnosis:
     """Measure a capture of any format. Raises InputError where it cannot be opened."""
     dataset = load_dataset(folder, image_size=SIZE)
     views = sorted((*dataset.train, *dataset.test), key=lambda view: view.time)
-    cameras, points = distinct_cameras(views), _points(dataset)
+    cameras, points = list(dict.fromkeys(view.camera for view in views)), _points(dataset)
     still = len(views) >= 2 * len(cameras)
     looks = _looks(folder, views, cameras if still else None)
     measures = [parallax(cameras, points), moving_share(looks)]
@@ -100,10 +101,6 @@ def diagnose(folder: Path) -> Diagnosis:
         measures.append(path(views, points))
         measures.append(exposure(looks, points if dataset.cloud is not None else None))
     return Diagnosis(dataset, still, measures, looks)
-
-
-def distinct_cameras(views: Sequence[View]) -> list[Camera]:
-    return list({id(view.camera): view.camera for view in views}.values())
 
 
 def _looks(folder: Path, views: Sequence[View], cameras: Sequence[Camera] | None) -> list[Look]:
