@@ -47,7 +47,7 @@ def _train(arguments: list[str]) -> None:
     if options["view"]:
         from lapgs_wgpu.viewer import live
 
-        live.check_window()  # before anything is written or replaced
+        live.window.check_window("leave out --view")  # before anything is written or replaced
         watch = live.watch
     if options["resume"]:
         _resume(Path(options["resume"]), options, overrides, watch, lpips)

@@ -12,12 +12,13 @@ from helpers.fields import COUNT, DYNAMICS, NEARBY, OURS, POINTS, ROWS, grid_fie
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields import grid_field as grid_field_module
-from lapgs_wgpu.motion.fields.config import PLANES, FieldConfig, FieldKind
+from lapgs_wgpu.motion.fields.config import FieldConfig, FieldKind
 from lapgs_wgpu.motion.fields.deformation import Deformation
 from lapgs_wgpu.motion.fields.hexplane_field import HexPlaneField
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion, TimeMotion
 from lapgs_wgpu.motion.fields.make_field import make_field
 from lapgs_wgpu.motion.fields.mlp_field import MlpField, octaves
+from lapgs_wgpu.motion.fields.parameter_shapes import PLANES
 
 KINDS: tuple[FieldKind, ...] = ("mlp", "hexplane", "grid4d", "laplacian")
 

@@ -30,11 +30,6 @@ _ATTENTION = 0.5  # seconds after a move in which the pictures come first
 _PATIENCE = 0.02  # seconds between looks at mouse and keys while the training rests
 
 
-def check_window() -> None:
-    """Raises InputError where no window can be opened here."""
-    window.check_window("leave out --view")
-
-
 def watch(path: Path, scene: Scene4D, initial_view: InitialView, steps: Iterator[TrainingStep]) -> None:
     """Show the scene in a window and take the training's steps, until the window is closed.
 

@@ -15,13 +15,8 @@ Motion = Literal["laplacian", "mlp"]
 NegativeScales = Literal["floor", "mirror"]
 Appearance = Literal["none", "color", "color+opacity"]
 MIN_SCALE = CONSTANTS["MIN_SCALE"]
-PLANES = ((0, 1), (0, 2), (1, 2), (0, TIME), (1, TIME), (2, TIME))  # of the field hexplane: pairs of x, y, z, t
 TEMPORAL_AXES = ((0, 1, TIME), (1, 2, TIME), (0, 2, TIME))  # of the temporal hash grids
 GEOMETRY = (4, 3, 4, 3)  # outputs of the grid fields' geometry heads: turn, shift, quaternion, scale
-HEXPLANE_HEADS = (3, 4, 3)  # outputs of the field hexplane's heads: shift, quaternion, scale
-# Of the field mlp: octaves of its inputs; features of the time; number of layers, and of the one that also takes the
-# inputs (skip connection); outputs: shift, quaternion, scale.
-PLACE_OCTAVES, TIME_OCTAVES, TIME_FEATURES, MLP_LAYERS, MLP_SKIP, MLP_OUTPUTS = 10, 6, 30, 8, 4, (3, 4, 3)
 # Factor of the appearance head's outputs. The head then learns about as fast as the colors; faster, it would explain
 # motion by changes of color.
 APPEARANCE_SCALE = 0.1
@@ -141,12 +136,3 @@ def static_grid(config: FieldConfig) -> GridShape:
 def temporal_grids(config: FieldConfig) -> list[GridShape]:
     """Return the space-time hash grids of the grid fields."""
     return [GridShape(config.temporal, axes) for axes in (TEMPORAL_AXES if config.temporal_hash else ())]
-
-
-def plane_shapes(config: PlaneConfig) -> list[tuple[int, int, int, int]]:
-    """Return the shape (1, features, second axis, first axis) of each plane of hexplane, six per resolution."""
-    shapes = []
-    for level in range(config.levels):
-        sizes = [config.space << level] * 3 + [config.time]
-        shapes += [(1, config.features, sizes[b], sizes[a]) for a, b in PLANES]
-    return shapes

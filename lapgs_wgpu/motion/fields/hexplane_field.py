@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from lapgs_wgpu.motion.fields.config import HEXPLANE_HEADS, PLANES, FieldConfig
+from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation, Field, Nearby
 from lapgs_wgpu.motion.fields.hash_grid_config import TIME
 from lapgs_wgpu.motion.fields.layers import linear, zero_head
-from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
+from lapgs_wgpu.motion.fields.parameter_shapes import HEXPLANE_HEADS, PLANES, parameter_shapes
 
 # Weights of the smoothness loss that 4D-GS trains with on D-NeRF scenes.
 SPACE_SMOOTHNESS, TIME_SMOOTHNESS, TIME_SPARSITY = 1e-4, 1e-2, 1e-4

@@ -7,10 +7,17 @@ import math
 import torch
 from torch import Tensor, nn
 
-from lapgs_wgpu.motion.fields.config import MLP_LAYERS, MLP_OUTPUTS, MLP_SKIP, PLACE_OCTAVES, TIME_OCTAVES, FieldConfig
+from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation, Field, Nearby
 from lapgs_wgpu.motion.fields.layers import linear, zero_head
-from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
+from lapgs_wgpu.motion.fields.parameter_shapes import (
+    MLP_LAYERS,
+    MLP_OUTPUTS,
+    MLP_SKIP,
+    PLACE_OCTAVES,
+    TIME_OCTAVES,
+    parameter_shapes,
+)
 
 
 class MlpField(Field):

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from lapgs_wgpu.motion.fields.config import (
-    GEOMETRY,
-    HEXPLANE_HEADS,
-    MLP_LAYERS,
-    MLP_OUTPUTS,
-    MLP_SKIP,
-    PLACE_OCTAVES,
-    TIME_FEATURES,
-    TIME_OCTAVES,
-    FieldConfig,
-    plane_shapes,
-    static_grid,
-    temporal_grids,
-)
+from lapgs_wgpu.motion.fields.config import GEOMETRY, FieldConfig, static_grid, temporal_grids
+from lapgs_wgpu.motion.fields.hash_grid_config import TIME
+
+PLANES = ((0, 1), (0, 2), (1, 2), (0, TIME), (1, TIME), (2, TIME))  # of the field hexplane: pairs of x, y, z, t
+HEXPLANE_HEADS = (3, 4, 3)  # outputs of the field hexplane's heads: shift, quaternion, scale
+# Of the field mlp: octaves of its inputs; features of the time; number of layers, and of the one that also takes the
+# inputs (skip connection); outputs: shift, quaternion, scale.
+PLACE_OCTAVES, TIME_OCTAVES, TIME_FEATURES, MLP_LAYERS, MLP_SKIP, MLP_OUTPUTS = 10, 6, 30, 8, 4, (3, 4, 3)
 
 Shapes = dict[str, tuple[int, ...]]
 
@@ -65,7 +59,11 @@ def _grid(config: FieldConfig) -> Shapes:
 
 def _hexplane(config: FieldConfig) -> Shapes:
     width = config.width
-    shapes: Shapes = {f"planes.{i}": shape for i, shape in enumerate(plane_shapes(config.planes))}
+    shapes: Shapes = {}
+    for level in range(config.planes.levels):
+        sizes = [config.planes.space << level] * 3 + [config.planes.time]
+        for a, b in PLANES:
+            shapes[f"planes.{len(shapes)}"] = (1, config.planes.features, sizes[b], sizes[a])
     shapes |= _layer("trunk.0", width, config.planes.features * config.planes.levels)
     for i in range(config.depth):
         shapes |= _layer(f"trunk.{2 * i + 2}", width, width)
