@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from lapgs_wgpu.data.cloud import Cloud
-from lapgs_wgpu.data.initial_gaussians import MIN_SCALE, initial_scales, limit_optical_depth, random_points
+from lapgs_wgpu.data.initial_gaussians import MIN_SCALE, initial_scales, limit_optical_depth
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.camera import Camera
@@ -31,7 +31,7 @@ ROOM = Dataset("room", VIEWS, VIEWS[:1], depths=(0.9, 3.7))
 
 
 def test_scales_match_all_pairs() -> None:
-    points, _ = random_points(200, -1.0, 2.0, 3)
+    points = np.random.default_rng(3).uniform(-1.0, 2.0, (200, 3)).astype(np.float32)
     squared = ((points[:, None].astype(np.float64) - points[None]) ** 2).sum(axis=-1)
     expected = np.sqrt(np.sort(squared, axis=1)[:, 1:4].mean(axis=1))
     scales = initial_scales(points)

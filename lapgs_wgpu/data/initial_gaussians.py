@@ -29,18 +29,10 @@ def first_points(
     if dataset.cloud is not None:
         return dataset.cloud.at_most(count, seed)
     if dataset.depths is None:
-        return random_points(count, -box, box, seed)
-    means = points_in_view(dataset.cameras, *dataset.depths, count, seed).astype(np.float32)
-    return means, np.full_like(means, 0.5)
-
-
-def random_points(n: int, low: float, high: float, seed: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Draw n points uniformly from the cube [low, high]^3: means (n, 3) in world units, colors (n, 3), RGB in [0, 1].
-
-    All colors are mid-gray, as in 3DGS (except for its noise of 1/255).
-    """
-    means = np.random.default_rng(seed).uniform(low, high, (n, 3)).astype(np.float32)
-    return means, np.full((n, 3), 0.5, dtype=np.float32)
+        means = np.random.default_rng(seed).uniform(-box, box, (count, 3))
+    else:
+        means = points_in_view(dataset.cameras, *dataset.depths, count, seed)
+    return means.astype(np.float32), np.full((count, 3), 0.5, np.float32)
 
 
 def initial_scales(points: NDArray[np.floating]) -> NDArray[np.float32]:

@@ -34,16 +34,6 @@ class GaussianSnapshot:
     log_scales: Floats
     quats: Floats
 
-    def __post_init__(self) -> None:
-        n = len(self.means)
-        if self.sh.ndim != 3 or self.sh.shape[1] not in (1, 4, 9, 16):
-            raise ValueError(f"sh has shape {self.sh.shape}, not (N, K, 3) with K of 1, 4, 9 or 16")
-        shapes = {"means": (n, 3), "opacity_logits": (n,), "log_scales": (n, 3), "quats": (n, 4)}
-        for name, shape in (shapes | {"sh": (n, self.sh.shape[1], 3)}).items():
-            array = getattr(self, name)
-            if array.shape != shape or array.dtype != np.float32:
-                raise ValueError(f"{name} is {array.dtype} {array.shape}, not float32 {shape}")
-
     def __len__(self) -> int:
         return len(self.means)
 
