@@ -124,7 +124,7 @@ def largest_error(playback: Playback, pieces: Pieces) -> float:
 
 
 def test_pieces_join_and_are_as_many_as_needed(scene: LoadedScene) -> None:
-    coarse, fine = (linear_pieces(scene.playback, far * pixel(scene), 1.0) for far in (2.0, 0.2))
+    coarse, fine = (linear_pieces(scene.playback, far * pixel(scene), 1.0, float) for far in (2.0, 0.2))
     assert len(fine.source) > len(coarse.source) >= COUNT
     for pieces, far in ((coarse, 2.0), (fine, 0.2)):
         assert largest_error(scene.playback, pieces) <= 1.2 * far * pixel(scene)
@@ -141,7 +141,7 @@ def test_what_stands_still_is_one_piece(device: Device, tmp_path: Path) -> None:
         for parameter in scene.field.parameters():
             parameter.zero_()
     scene.save(tmp_path / "a.ply")
-    pieces = linear_pieces(open_playback(tmp_path / "a.ply", device), 1e-4, 0.01)
+    pieces = linear_pieces(open_playback(tmp_path / "a.ply", device), 1e-4, 0.01, float)
     assert len(pieces.source) == COUNT
     assert np.abs(pieces.slopes).max() < 1e-4
 

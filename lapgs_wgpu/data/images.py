@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -187,6 +189,16 @@ def blurred(values: NDArray[np.float64]) -> NDArray[np.bool_]:
 def repeats(gray: NDArray[np.float32], before: NDArray[np.float32]) -> bool:
     """Whether a thumbnail shows the same as the one before."""
     return gray.shape == before.shape and bool(np.abs(gray - before).max() <= EQUAL)
+
+
+def blurred_and_repeated(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
+    """The images of one camera, in the order of time, that are blurred, and those that repeat the one before. Raises
+    InputError."""
+    with ThreadPoolExecutor(4, thread_name_prefix="thumbnails") as pool:
+        gray = list(pool.map(lambda path: gray_thumbnail(path, THUMBNAIL), paths))
+    soft = blurred(np.array([sharpness(each) for each in gray]))
+    repeated = [path for path, (before, now) in zip(paths[1:], pairwise(gray), strict=True) if repeats(now, before)]
+    return [path for path, bad in zip(paths, soft, strict=True) if bad], repeated
 
 
 @contextmanager

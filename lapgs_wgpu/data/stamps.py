@@ -41,11 +41,6 @@ class ImageName(NamedTuple):
         """The text that states the time."""
         return self.part or PurePosixPath(self.file).stem
 
-    @property
-    def timed_folder(self) -> bool:
-        """Whether a folder states the time."""
-        return self.part in PurePosixPath(self.file).parts
-
 
 def natural_key(name: str) -> tuple[tuple[int, int | str], ...]:
     """Sort key that puts cam2 before cam10."""

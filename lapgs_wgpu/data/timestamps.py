@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from contextlib import suppress
 from itertools import pairwise
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,8 @@ def read_times(names: Sequence[ImageName], folder: Path) -> tuple[list[float], s
     path = folder / TIMES
     if path.is_file():
         return _listed(names, path), str(path)
-    whose = f"the names of folders in {folder}" if names[0].timed_folder else f"the names of {folder}"
+    folders = names[0].part in PurePosixPath(names[0].file).parts  # state the times
+    whose = f"the names of folders in {folder}" if folders else f"the names of {folder}"
     if clocks := clock_times(names):
         times, kind = clocks
         return times, f"the {kind} in {whose}"

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -18,19 +17,7 @@ from lapgs_wgpu.data.cloud import Cloud, in_view, views_of
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.focus import spread
 from lapgs_wgpu.data.frames import Frame
-from lapgs_wgpu.data.images import (
-    BLURRED,
-    EQUAL,
-    THUMBNAIL,
-    ImageFile,
-    Size,
-    blurred,
-    decode,
-    gray_thumbnail,
-    repeats,
-    sharpness,
-    size_text,
-)
+from lapgs_wgpu.data.images import BLURRED, EQUAL, ImageFile, Size, blurred_and_repeated, decode, size_text
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.placement import near_focus
 from lapgs_wgpu.data.poses import AXES_HINT
@@ -314,11 +301,7 @@ def check_film(images: Sequence[Path]) -> list[str]:
     """Warn about images of one camera, in the order of time, that are blurred or repeated."""
     if len(images) < 3:
         return []
-    with ThreadPoolExecutor(4, thread_name_prefix="thumbnails") as pool:
-        thumbnails = list(pool.map(lambda path: gray_thumbnail(path, THUMBNAIL), images))
-    values = np.array([sharpness(thumbnail) for thumbnail in thumbnails])
-    blurry = [image.name for image, bad in zip(images, blurred(values), strict=True) if bad]
-    repeated = [images[i].name for i in range(1, len(images)) if repeats(thumbnails[i], thumbnails[i - 1])]
+    blurry, repeated = ([image.name for image in bad] for bad in blurred_and_repeated(images))
     why = {
         "blurred": (blurry, f"have less than {BLURRED:g} of their neighbours' sharpness"),
         "repeated": (

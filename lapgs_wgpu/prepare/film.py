@@ -21,7 +21,7 @@ from lapgs_wgpu.data.video_frames import (
     pixel_aspect,
 )
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.prepare.hdr import to_sdr, transfer_of
+from lapgs_wgpu.prepare.hdr import TRANSFERS, to_sdr
 
 _FAST_BILINEAR = 0x1  # of swscale: exact enough for a thumbnail
 
@@ -41,7 +41,7 @@ class Frame(NamedTuple):
 def _pixels(frame: Any, size: Size, shape: Display, longer_side: int) -> Pixels:
     """size: of the frame's square pixels, not yet turned."""
     width, height = shrunk_size(size, longer_side)
-    transfer = transfer_of(frame)
+    transfer = TRANSFERS.get(int(frame.color_trc))
     form = "rgb24" if transfer is None else "rgb48le"
     image = frame.to_ndarray(format=form, width=width, height=height, interpolation=EXACT_COLORS)
     return shape.apply(image if transfer is None else to_sdr(image, transfer))

@@ -6,7 +6,7 @@ rolled off by a curve that keeps what is below three quarters of it.
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lapgs_wgpu.data.images import Pixels
 
 Transfer = Literal["HLG", "PQ"]
-_NUMBERS: dict[int, Transfer] = {18: "HLG", 16: "PQ"}  # of ISO/IEC 23091-2
+TRANSFERS: dict[int, Transfer] = {18: "HLG", 16: "PQ"}  # by their numbers in ISO/IEC 23091-2
 
 REFERENCE_WHITE = 203.0  # cd/m2, ITU-R BT.2408
 PEAK = 1000.0  # cd/m2 of the display for which HLG is shown
@@ -22,11 +22,6 @@ KNEE = 0.75  # of the reference white: above it light is rolled off
 _LEVELS = 4096  # of the tables: 12 bits, more than films have
 TO_BT709 = np.array([[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]])
 LUMINANCE = np.array([0.2627, 0.6780, 0.0593])  # of BT.2020's red, green, blue
-
-
-def transfer_of(frame: Any) -> Transfer | None:
-    """The HDR transfer function of a decoded frame; None for an ordinary film."""
-    return _NUMBERS.get(int(frame.color_trc))
 
 
 def to_sdr(image: NDArray[np.uint16], transfer: Transfer) -> Pixels:

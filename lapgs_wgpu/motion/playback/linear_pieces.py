@@ -48,9 +48,7 @@ class Pieces(NamedTuple):
     dc: Floats
 
 
-def linear_pieces(
-    playback: Playback, farthest: float, shade: float, done: Callable[[float], object] = lambda share: None
-) -> Pieces:
+def linear_pieces(playback: Playback, farthest: float, shade: float, done: Callable[[float], object]) -> Pieces:
     """Bake a playback. Gaussians that no pass draws during a piece are left out of it.
 
     farthest: largest distance, at the samples, of a point of an ellipsoid of one standard deviation from where the
