@@ -68,8 +68,8 @@ class HashEncoder:
         for array, table in zip(arrays, tables, strict=True):
             array.write(_host(table))
         with Commands(self._device) as commands:
-            for passes, *arguments in self._by_group(sets, arrays):
-                passes.encode(commands, *arguments)
+            for passes, points, of_group, encoding in self._by_group(sets, arrays):
+                passes.encode(commands, points, of_group, encoding)
         return _read([array for _, encodings in sets for array in encodings], places)
 
     def backward(self, places: Sequence[Place], d_encodings: Sequence[Tensor]) -> list[Tensor]:
@@ -82,8 +82,8 @@ class HashEncoder:
         with Commands(self._device) as commands:
             for array in arrays:
                 commands.clear(array)
-            for passes, points, tables, encoding in self._by_group(sets, arrays):
-                passes.add_gradient(commands, points, encoding, tables)
+            for passes, points, of_group, encoding in self._by_group(sets, arrays):
+                passes.add_gradient(commands, points, encoding, of_group)
         return _read(arrays, places)
 
     def _tables(self) -> list[DeviceArray]:
