@@ -93,8 +93,7 @@ def draw(folder: Path, cache_gb: float, steps: int, step: float) -> dict[str, fl
 
     from lapgs_wgpu.data import load_dataset
     from lapgs_wgpu.gpu.device import open_device
-    from lapgs_wgpu.train.ground_truth import GroundTruth
-    from lapgs_wgpu.train.trainer import AHEAD
+    from lapgs_wgpu.train.ground_truth import AHEAD, GroundTruth
     from lapgs_wgpu.train.view_order import Draws
 
     start = time.perf_counter()
