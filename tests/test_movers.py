@@ -51,6 +51,14 @@ def test_cutouts_show_what_moves_where_it_is_in_each_image() -> None:
         assert shown[mask].mean() > 0.4  # no more than a point a pixel
 
 
+def test_masks_are_completed_by_what_differs_beside_them() -> None:
+    still, taken = np.full((2, 96, 128, 3), 0.5, np.float32)
+    taken[20:80, 30:60] = taken[10:30, 100:120] = 1.0
+    told, whole = np.zeros((2, 96, 128), bool)
+    told[20:50, 30:60] = whole[20:80, 30:60] = True  # half of one thing, and nothing of the other
+    np.testing.assert_array_equal(Residual(CAMERAS[0], 0.0, taken, still, told).mask, whole)
+
+
 def test_the_cube_of_movers_holds_them_and_not_the_room() -> None:
     points, colors = room_cloud(400, 0.0)
     seen = [(camera, lambda mask=mask: mask) for camera, (_, mask) in zip(CAMERAS, TAKEN, strict=True)]

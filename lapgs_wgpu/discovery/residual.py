@@ -18,6 +18,7 @@ Mask = NDArray[np.bool_]
 
 FALLOFF = 1.5  # pixels; standard deviation of the mask's soft border
 BLUR = 2.0  # pixels; standard deviation of the colors that views are compared by
+PARTLY = 0.3  # share of a thing that masks tell, from which on it is a mover
 
 
 class Samples(NamedTuple):
@@ -44,7 +45,7 @@ class Residual:
         time: in [0, 1].
         image: (H, W, 3) in [0, 1].
         still: (H, W, 3), the static fit's image of the same camera.
-        moving: (H, W), the moving pixels; None to find them.
+        moving: (H, W), the moving pixels as masks tell them, which are completed; None to find them.
 
     Attributes:
         mask: (H, W), the moving pixels.
@@ -52,7 +53,8 @@ class Residual:
 
     def __init__(self, camera: Camera, time: float, image: Floats, still: Floats, moving: Mask | None = None) -> None:
         self.camera, self.time, self.image, self.still = camera, time, image, still
-        self.mask = differing_pixels(image, still) if moving is None else moving
+        differs = differing_pixels(image, still)
+        self.mask = differs if moving is None else _completed(moving, differs)
 
     @cached_property
     def _soft(self) -> Floats:
@@ -90,3 +92,10 @@ class Residual:
         u, v = (columns + 0.5 - K[0, 2]) / K[0, 0], (rows + 0.5 - K[1, 2]) / K[1, 1]
         directions = np.stack([u, v, np.ones(len(rows))], axis=1) @ self.camera.T_cam_world[:3, :3]
         return Rays(directions.astype(np.float32), self._blurred[rows, columns], self.image[rows, columns])
+
+
+def _completed(moving: Mask, differs: Mask) -> Mask:
+    """The moving pixels, and the rest of what differs where they tell a part: legs too fast for masks from flow."""
+    labels, count = ndimage.label(ndimage.binary_fill_holes(differs))
+    told = ndimage.mean(moving, labels, np.arange(count) + 1)
+    return moving | np.isin(labels, 1 + np.flatnonzero(told > PARTLY))
