@@ -17,6 +17,7 @@ from view_alignment import aligned_view
 
 from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.discovery.start_training import start_training
+from lapgs_wgpu.discovery.static_fit import static_config
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.camera import Camera
@@ -34,7 +35,6 @@ from lapgs_wgpu.train.config import CamerasConfig, Rate
 from lapgs_wgpu.train.fused_loss import render_loss
 from lapgs_wgpu.train.ground_truth import upload_rgba
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.static_config import static_config
 from lapgs_wgpu.train.trainer import Trainer
 
 CONFIG = CamerasConfig("on", Rate(1e-2, 1e-2, 1), 0.0, 1)

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar
 
 from lapgs_wgpu.io.dataclass_table import Options, option
 from lapgs_wgpu.motion.fields.config import FieldConfig
@@ -20,6 +21,7 @@ Split = Literal["plain", "adaptive"]
 Units = Literal["world", "capture"]
 StepPlace = Literal["auto", "exchange", "resident"]
 RefineCameras = Literal["auto", "on", "off"]
+Table = TypeVar("Table", bound=Options)
 
 
 @dataclass(frozen=True)
@@ -323,3 +325,11 @@ class Config(Options):
         "torch computes (fields other than static, grid4d and laplacian), else resident",
         "auto",
     )
+
+
+def changed(table: Table, values: Mapping[str, Any]) -> Table:
+    """A copy of a configuration, or of a table of it, with other values by dotted key, such as `schedule.steps`."""
+    for key, value in values.items():
+        name, _, rest = key.partition(".")
+        table = dataclasses.replace(table, **{name: changed(getattr(table, name), {rest: value}) if rest else value})
+    return table
