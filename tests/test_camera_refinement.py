@@ -34,6 +34,7 @@ from lapgs_wgpu.train.camera_refinement import (
 from lapgs_wgpu.train.config import CamerasConfig, Rate
 from lapgs_wgpu.train.fused_loss import render_loss
 from lapgs_wgpu.train.ground_truth import upload_rgba
+from lapgs_wgpu.train.learners import restore_tensors
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.trainer import Trainer
 
@@ -230,7 +231,7 @@ def test_what_discovery_corrected_stays_corrected(device: Device, dataset: Datas
 def test_state_of_other_cameras_is_refused() -> None:
     state = refinement_of(cameras(4)).state()
     with pytest.raises(ValueError, match="camera learnt"):
-        refinement_of(cameras(5)).restore(state)
+        restore_tensors(refinement_of(cameras(5)).state(), state, "camera")
     state["square"] -= 1
     with pytest.raises(ValueError, match="negative"):
-        refinement_of(cameras(4)).restore(state)
+        restore_tensors(refinement_of(cameras(4)).state(), state, "camera")

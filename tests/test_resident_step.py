@@ -99,7 +99,7 @@ def by_torch(trainer: Trainer, sample: Task, *, moving: bool) -> dict[str, Tenso
     if trainer.cameras is not None:
         d_camera = trainer.cameras.values.grad.sum(dim=0).reshape(2, 3)
         gradients["cameras"] = torch.nn.functional.pad(d_camera, (0, 1)).flatten()
-        gradients["exposures"] = trainer._learners.exposures.values.grad.sum(dim=0).flatten()
+        gradients["exposure"] = trainer._learners.exposures.values.grad.sum(dim=0).flatten()
     return gradients
 
 
