@@ -41,7 +41,7 @@ from lapgs_wgpu.train.config import LossWeights, Rate
 from lapgs_wgpu.train.exchange_step import ExchangeStep
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.ground_truth import LEFT_OUT, upload_rgba
-from lapgs_wgpu.train.loss_terms import LossTerm, torch_loss
+from lapgs_wgpu.train.parts import LossTerm, torch_loss
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run_folder import load_state, save_state
 

@@ -17,9 +17,9 @@ from lapgs_wgpu.train.density_control import DensityControl
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.ground_truth import AHEAD, GroundTruth
 from lapgs_wgpu.train.learners import Learners
-from lapgs_wgpu.train.loss_terms import LossTerm, Regularizer, weight_at
 from lapgs_wgpu.train.motion_losses import acceleration_loss, compared_counts, draw_nearby, draw_times
 from lapgs_wgpu.train.nonfinite import Skipped, cause, check_parameters, finite
+from lapgs_wgpu.train.parts import LossTerm, Regularizer, weight_at
 from lapgs_wgpu.train.step_result import Measured, Scheduled
 from lapgs_wgpu.train.view_order import Draws
 

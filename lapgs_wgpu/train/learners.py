@@ -34,7 +34,7 @@ class Learners:
         self._groups = scene.field.parameter_groups() if scene.field else {}
         rates = parts.rates_of(config.rates.schedules(), scene.parameters, self._groups)
         self.optimizer = Optimizer(scene.parameters, self._groups, rates)
-        self.field_fitted = start.field_fitted
+        self.set_field_fitted(start.field_fitted)
         self.frequencies = None
         if scene.spectrum is not None:
             limit = nyquist_frequency(dataset)
@@ -67,14 +67,9 @@ class Learners:
         self.on_access()
         return self._exposures
 
-    @property
-    def field_fitted(self) -> float:
+    def set_field_fitted(self, fitted: float) -> None:
         """Not 0 where discovery fitted the field to nearly all that moves: its rates are then held low (`Start`)."""
-        return self._field_fitted
-
-    @field_fitted.setter
-    def field_fitted(self, fitted: float) -> None:
-        self._field_fitted = fitted
+        self.field_fitted = fitted
         self.optimizer.highest = max_field_rates(self._groups, fitted) if fitted else {}
 
     def camera(self, view: View) -> Camera:

@@ -6,7 +6,6 @@ import math
 import operator
 import statistics
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -80,15 +79,14 @@ def plan_training(
     *,
     minutes: float | None = None,
     exposure: bool = False,
-    measure: Callable[[Config, Dataset, Device], float] = step_seconds,
 ) -> Plan:
     """Choose the training of a capture: a small preset on a CPU device; on others a large one, where its schedule, or
     most of it, fits into the time. Its steps are those of its schedule, more where the clip has many times, fewer where
     the time is short.
 
     opened: the capture of the folder, with images of any size. minutes: that the training may take, about; None for the
-    whole schedule. exposure: whether to learn a color correction for each image. measure: times a step, seconds. Raises
-    InputError where the capture is not usable, or the time is too short for anything.
+    whole schedule. exposure: whether to learn a color correction for each image. Raises InputError
+    where the capture is not usable, or the time is too short for anything.
     """
     if minutes is not None and not 0 < minutes < math.inf:
         raise InputError(f"--minutes must be above 0, got {minutes:g}.")
@@ -103,7 +101,7 @@ def plan_training(
         config = changed(config, {"density.limit": 2 * config.points.count})
         dataset = open_dataset(config)
         try:
-            step = measure(config, dataset, device)
+            step = step_seconds(config, dataset, device)
         except DeviceMemoryError:
             if last:
                 raise

@@ -307,7 +307,7 @@ class Trainer:
         own = parts["training"]
         self.done, scene.sh_degree = int(own["done"]), int(own["sh_degree"])
         self.warm_up_steps, self._ramp_steps = int(own["warm_up"]), int(own["rising"])
-        self._learners.field_fitted = float(own["field_fitted"])
+        self._learners.set_field_fitted(float(own["field_fitted"]))
         self._generator.set_state(own["random"])
         self._draws.left = own["order"].tolist()
         self._plans.set_bands(self._drawn, int(own["bands"]))
