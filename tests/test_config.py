@@ -165,7 +165,7 @@ def test_presets_correct_times_after_density_control(preset: str) -> None:
         ('base = "dnerf"\nseed = -1', "seed must lie between 0 and 2147483647, got -1"),
         ('base = "dnerf"\n[loss]\nssim = nan', "loss.ssim must lie between 0 and 2147483647, got nan"),
         ('base = "dnerf"\n[field.static]\nbase = [1, 2]', "field.static.base must be 3 numbers, got [1, 2]"),
-        ('base = "dnerf"\n[data]\nbackground = "blak"', "must be black or white or random, got 'blak'"),
+        ('base = "dnerf"\n[data]\nbackground = "blak"', "must be black or white, got 'blak'"),
         ("[data]\nsize = 1", 'start the file with base = "dnerf"'),
         ("base = 3", "base must be the name of a preset, got 3"),
         ('base = "nerf"', "there is no preset 'nerf'; did you mean dnerf?"),

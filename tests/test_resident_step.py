@@ -91,8 +91,7 @@ def by_torch(trainer: Trainer, sample: Task, *, moving: bool) -> dict[str, Tenso
         nearby = Nearby(chosen, offsets, sample.near_time, smooth.static, smooth.temporal)
     if sample.even is not None:
         times = TimeSamples(sampled_rows.rows(sample.even), sample.even_times)
-    scheduled, background = Scheduled(4, moving, 1.0, seen=True), torch.tensor(sample.background)
-    trainer._exchange._descend(scheduled, sample.view, background, nearby, times)
+    trainer._exchange._descend(Scheduled(4, moving, 1.0, seen=True), sample.view, nearby, times)
     scene = trainer.scene
     named = {**scene.parameters, **(dict(scene.field.named_parameters()) if scene.field else {})}
     gradients = {name: torch.zeros_like(p) if p.grad is None else p.grad for name, p in named.items()}

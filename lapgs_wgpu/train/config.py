@@ -15,8 +15,8 @@ from typing import Any, Literal, NamedTuple, TypeVar
 from lapgs_wgpu.io.dataclass_table import Options, option
 from lapgs_wgpu.motion.fields.config import FieldConfig
 
-Background = Literal["black", "white", "random"]
-BACKGROUND_LEVELS = {"black": 0.0, "white": 1.0, "random": 0.0}  # under views that are measured
+Background = Literal["black", "white"]
+BACKGROUND_LEVELS = {"black": 0.0, "white": 1.0}
 Split = Literal["plain", "adaptive"]
 Units = Literal["world", "capture"]
 StepPlace = Literal["auto", "exchange", "resident"]
@@ -29,9 +29,7 @@ class DataConfig(Options):
     """The capture."""
 
     size: int = option("longer side of the images, pixels; larger images are downscaled; 0: the original size")
-    background: Background = option(
-        "color behind the Gaussians and behind transparent images; random: a new one each step, black in evaluation"
-    )
+    background: Background = option("color behind the Gaussians and behind transparent images")
     cache_gb: float = option("memory limit for the images that are kept on the device, gigabytes")
     undistort: bool = option("resample images of lenses with distortion or skew to those of a pinhole camera", True)
     units: Units = option(

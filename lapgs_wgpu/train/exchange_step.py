@@ -52,11 +52,11 @@ class ExchangeStep:
         Raises NumericalError where a parameter is not finite.
         """
         step, draws = scheduled.step, self._draws
-        (view, background), drawn = draws.next(), draws.mark()
+        view, drawn = draws.next(), draws.mark()
         compared = self._compared(scheduled, self._scene.timing(view.time))
         self._truth.prefetch([view, *draws.coming(AHEAD)])
         self._learners.zero_grad()
-        measured, rendering = self._descend(scheduled, view, background, *compared)
+        measured, rendering = self._descend(scheduled, view, *compared)
         d_means2d = rendering.means2d.grad
         assert d_means2d is not None
         what = self._not_finite(measured, d_means2d, began)
@@ -85,7 +85,6 @@ class ExchangeStep:
         self,
         scheduled: Scheduled,
         view: View,
-        background: Tensor,
         nearby: Nearby | None,
         time_samples: TimeSamples | None,
     ) -> tuple[Measured, RenderLoss]:
@@ -100,7 +99,7 @@ class ExchangeStep:
             now.gaussians,
             learners.camera(view),
             self._truth.on_device(view),
-            background,
+            self._truth.color,
             weights,
             scene.device,
             learners.exposure(view),

@@ -64,9 +64,9 @@ def render_loss(
     The same bits on every run of one adapter and driver. The gradients are always computed.
 
     gaussians: activated, float32, with harmonics. truth: (H, W) as `upload_rgba` leaves it, of the camera's size.
-    background: (3,) in [0, 1], under both; not differentiable. correction: (3, 4) of the image's colors before they are
-    compared (train/exposure). own: further terms of the image, with their weights. camera_change: (6,) zeros, which get
-    the gradient by a small change of the camera: rotation, shift in units of `camera_unit`, world units
+    background: (3,) in [0, 1], under the rendering; not differentiable. correction: (3, 4) of the image's colors before
+    they are compared (train/exposure). own: further terms of the image, with their weights. camera_change: (6,) zeros,
+    which get the gradient by a small change of the camera: rotation, shift in units of `camera_unit`, world units
     (splat.drawing.CameraGradient).
     """
     probe = gaussians.means.new_empty((len(gaussians), 2)).requires_grad_()
@@ -100,10 +100,10 @@ class _FusedLoss(torch.autograd.Function):
             d_rows = []
             with Commands(device) as commands:
                 image = drawing.image if corrections is None else exposing.record(commands, drawing.image, corrections)
-                terms, d_image = losses.record(commands, image, truth, background, weights)
+                terms, d_image = losses.record(commands, image, truth, weights)
             own_values = []
             for term, weight in own:
-                value, gradient = torch_loss(term, image, truth, background, weight)
+                value, gradient = torch_loss(term, image, truth, weight)
                 own_values.append(value)
                 d_image.write(d_image.read() + gradient)
             if corrections is not None:

@@ -134,16 +134,14 @@ def weight_at(term: LossTerm, step: int) -> float:
     return float(term.weight(step) if callable(term.weight) else term.weight)
 
 
-def torch_loss(
-    term: TorchLoss, image: DeviceArray, truth: DeviceArray, background: tuple[float, float, float], weight: float
-) -> tuple[float, np.ndarray]:
+def torch_loss(term: TorchLoss, image: DeviceArray, truth: DeviceArray, weight: float) -> tuple[float, np.ndarray]:
     """The value of a term, and its weighted gradient (4, H, W) by the image.
 
-    image: (4, H, W) red, green, blue, transmittance. truth: (H, W) uint32 RGBA of the ground truth, whose transparent
-    pixels lie on the background. Raises InputError where the term returns no scalar.
+    image: (4, H, W) red, green, blue, transmittance. truth: (H, W) uint32 RGBA of the ground truth. Raises
+    InputError where the term returns no scalar.
     """
     planes, texels = read_all([image, truth])
-    target, left_out = host_image(texels, torch.tensor(background))
+    target, left_out = host_image(texels)
     with torch.enable_grad():
         shown = torch.from_numpy(planes[:3]).permute(1, 2, 0).requires_grad_()
         value = term.function(shown, torch.where(left_out, shown.detach(), target))
