@@ -148,7 +148,7 @@ def test_a_correction_that_fails_changes_nothing(
 ) -> None:
     """The state of the steps before can be saved."""
 
-    def lost(self: GroundTruth, view: View, color: Tensor) -> HostImage:
+    def lost(self: GroundTruth, view: View) -> HostImage:
         raise InputError("the disk is gone")
 
     monkeypatch.setattr(GroundTruth, "on_host", lost)

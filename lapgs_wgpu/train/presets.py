@@ -96,7 +96,10 @@ def load_config(
             hint = f" any more: {REMOVED[key]}." if key in REMOVED else did_you_mean(key, known)
             raise InputError(f"there is no key {key!r}{hint}")
         texts = isinstance(value, str) or (isinstance(value, list) and all(isinstance(each, str) for each in value))
-        _set(base, key, from_text(value, known[key]) if texts else value)
+        parsed = from_text(value, known[key]) if texts else value
+        for part in reversed(key.split(".")):
+            parsed = {part: parsed}
+        base = _merge(base, parsed)
     return build_dataclass(Config, base, preset, advice=ADVICE)
 
 
@@ -202,14 +205,6 @@ def _merge(below: Table, above: Table) -> Table:
         both = isinstance(value, dict) and isinstance(below.get(key), dict)
         merged[key] = _merge(below[key], value) if both else value
     return merged
-
-
-def _set(table: Table, key: str, value: Any) -> None:
-    *path, name = key.split(".")
-    for part in path:
-        inner = table.get(part)
-        table[part] = table = dict(inner) if isinstance(inner, dict) else {}
-    table[name] = value
 
 
 def _toml_lines(table: Mapping[str, Any], prefix: str) -> Iterator[str]:

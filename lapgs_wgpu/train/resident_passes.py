@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 from lapgs_wgpu.data.views import View
 from lapgs_wgpu.gpu.array import DeviceArray
@@ -58,11 +58,8 @@ class Task:
     counts: dict[str, int] = field(default_factory=dict)
 
 
-class Recorded(NamedTuple):
-    """The passes of a step. told: what is read of it later."""
-
-    drawing: Drawing
-    told: list[DeviceArray]
+# The passes of a step: its drawing, and what is read of it later.
+Recorded = tuple[Drawing, list[DeviceArray]]
 
 
 class ResidentPasses:
@@ -140,7 +137,7 @@ class ResidentPasses:
         self._recordings = {key: each for key, each in self._recordings.items() if each[0].holds}
         if shape in self._recordings:
             recording, step = self._recordings[shape]
-            step.drawing.camera = camera
+            step[0].camera = camera
             commands.replay(recording)
             return step
         if self._device.textures:  # copies to them depend on what was done before
@@ -167,7 +164,7 @@ class ResidentPasses:
         corrections.sum_camera(commands, by_drawn.camera)
         self._record_bwd(commands, drawn, by_drawn, decodings, totals)
         self._record_end(commands, task, drawing, by_drawn, terms, judged=judged)
-        return Recorded(drawing, [guard, bad, terms, totals, *drawing.needed])
+        return drawing, [guard, bad, terms, totals, *drawing.needed]
 
     def _decode(self, commands: Commands, task: Task) -> tuple[Decoding, Comparison | None, Line | None] | None:
         """Record the field; what varies from step to step is asked for anew."""
