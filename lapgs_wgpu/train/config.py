@@ -329,5 +329,6 @@ def changed(table: Table, values: Mapping[str, Any]) -> Table:
     """A copy of a configuration, or of a table of it, with other values by dotted key, such as `schedule.steps`."""
     for key, value in values.items():
         name, _, rest = key.partition(".")
-        table = dataclasses.replace(table, **{name: changed(getattr(table, name), {rest: value}) if rest else value})
+        new = changed(getattr(table, name), {rest: value}) if rest else value
+        table = dataclasses.replace(table, **{name: new})  # type: ignore[type-var]
     return table
