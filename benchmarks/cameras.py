@@ -19,9 +19,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from helpers.disturbed_walk import disturbed_walk, pose_errors
 from view_alignment import aligned_view
 
+from lapgs_wgpu.discovery.static_fit import static_config
 from lapgs_wgpu.gpu.device import open_device
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.static_config import static_config
 from lapgs_wgpu.train.trainer import Trainer
 
 SIZE, COUNT, STEPS, START = 100, 24, 1500, 100

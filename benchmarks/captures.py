@@ -103,7 +103,7 @@ def draw(folder: Path, cache_gb: float, steps: int, step: float) -> dict[str, fl
     for frame in data.train[:: len(data.times)]:
         frame.load()
     unpacking, after_unpacking = time.perf_counter() - start, megabytes()
-    draws = Draws(data.train, torch.Generator().manual_seed(0), torch.zeros(3))
+    draws = Draws(data.train, torch.Generator().manual_seed(0))
     with closing(GroundTruth(open_device(), torch.zeros(3), int(cache_gb * 1e9))) as truth:
         waits = []
         for _ in range(steps):

@@ -20,9 +20,9 @@ from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.images import encode_png
 from lapgs_wgpu.run import train
 from lapgs_wgpu.train.evaluate import evaluate
-from lapgs_wgpu.train.open_dataset import open_dataset, resolve_data
 from lapgs_wgpu.train.plan import scale_schedule
 from lapgs_wgpu.train.presets import load_config
+from lapgs_wgpu.train.setup import open_dataset, resolve_data
 
 RATE = 24  # frames a second
 LIMIT = "24000"  # Gaussians

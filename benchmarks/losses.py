@@ -43,7 +43,7 @@ def bench_losses(device: Device, size: int, meter: Meter | None, repeat: int) ->
     def kernels() -> DeviceArray:
         planes.buffer.version += 1  # as if it were newly drawn
         with Commands(device) as commands:
-            terms, d_image = losses.record(commands, planes, held, (0.0, 0.0, 0.0), WEIGHTS)
+            terms, d_image = losses.record(commands, planes, held, WEIGHTS)
         terms.read()
         return d_image
 

@@ -23,8 +23,8 @@ from lapgs_wgpu.data.views import View, composite
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS
 from lapgs_wgpu.train.evaluate import to_8_bit
-from lapgs_wgpu.train.open_dataset import open_dataset
 from lapgs_wgpu.train.presets import load_config
+from lapgs_wgpu.train.setup import open_dataset
 
 THRESHOLD = 16  # levels of 255 in any channel: above the noise of a compressed video
 LEAST_TIMES = 5  # of a camera, for a median

@@ -39,8 +39,8 @@ from lapgs_wgpu.data.views import View, composite
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS
 from lapgs_wgpu.train.evaluate import to_8_bit
 from lapgs_wgpu.train.image_metrics import psnr_of
-from lapgs_wgpu.train.open_dataset import open_dataset
 from lapgs_wgpu.train.presets import load_config
+from lapgs_wgpu.train.setup import open_dataset
 
 CONTRAST = 0.5
 REACH = 1.0  # diameters from the true mask within which a silhouette is looked for

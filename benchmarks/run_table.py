@@ -29,9 +29,9 @@ from lapgs_wgpu.io.safe_json_toml import read_json, read_toml
 from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.lpips import Lpips
-from lapgs_wgpu.train.open_dataset import open_dataset, resolve_data
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run_folder import has_state
+from lapgs_wgpu.train.setup import open_dataset, resolve_data
 
 _NAME = re.compile(r"\w[\w .+=-]*", re.ASCII)  # of a scene or a row: of a folder, and a cell of a Markdown table
 # Columns of the printed table: entry of a result, heading, format.

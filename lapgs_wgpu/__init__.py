@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     from lapgs_wgpu.splat.rasterization import rasterization
     from lapgs_wgpu.splat.rasterize import Rendering, rasterize
     from lapgs_wgpu.train.densify import Change, DensityState, published_rule
-    from lapgs_wgpu.train.loss_terms import Regularizer, TorchLoss
-    from lapgs_wgpu.train.parts import Parts
+    from lapgs_wgpu.train.parts import Parts, Regularizer, TorchLoss
     from lapgs_wgpu.train.presets import load_config
     from lapgs_wgpu.train.step_result import StepResult
     from lapgs_wgpu.train.trainer import Trainer
@@ -45,8 +44,8 @@ _HOMES = {
     "StepResult": "train.step_result",
     "Parts": "train.parts",
     "Deformation": "motion.fields.deformation",
-    "Regularizer": "train.loss_terms",
-    "TorchLoss": "train.loss_terms",
+    "Regularizer": "train.parts",
+    "TorchLoss": "train.parts",
     "DensityState": "train.densify",
     "Change": "train.densify",
     "published_rule": "train.densify",

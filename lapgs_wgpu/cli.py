@@ -161,7 +161,7 @@ def _config_of(run: Path, overrides: dict[str, typing.Any], advice: str) -> Conf
 
 def _open_data(config: Config, parent: Path) -> tuple[Config, Dataset]:
     """The dataset, and the configuration with its folder. parent: folder for the built-in scene."""
-    from lapgs_wgpu.train.open_dataset import open_dataset, resolve_data
+    from lapgs_wgpu.train.setup import open_dataset, resolve_data
 
     config = resolve_data(config, parent)
     return config, open_dataset(config)

@@ -6,6 +6,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -229,19 +230,13 @@ def _steps(training: Trainer, out: Path, interrupted: threading.Event) -> Iterat
 def _saved(training: Trainer, out: Path) -> str:
     """Save the state of a training that cannot go on, if it has one worth saving; what a user should know of it."""
     if training.whole and training.done:
-        try:
-            save_state(out, training.state())
-        except InputError as error:  # no second trouble instead of the first
-            return f" (and {error})"
-        except DeviceError:  # which has the newest parameters, and gives nothing any more
-            return _saved_before(out)
-        return f"; stopped after step {training.done}, from which lapgs-train --resume {quoted(out)} goes on."
-    return _saved_before(out)
-
-
-def _saved_before(out: Path) -> str:
-    """What a user should know of a training whose present state is lost."""
-    if (out / STATE).exists():
+        with suppress(DeviceError):  # which has the newest parameters, and gives nothing any more
+            try:
+                save_state(out, training.state())
+            except InputError as error:  # no second trouble instead of the first
+                return f" (and {error})"
+            return f"; stopped after step {training.done}, from which lapgs-train --resume {quoted(out)} goes on."
+    if has_state(out):
         return f"; lapgs-train --resume {quoted(out)} goes on from the state that was saved last."
     return "; nothing was saved yet."
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from lapgs_wgpu.command import DEVICE_HELP, LIST_DEVICES_HELP, HelpFormatter, Parser
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.dataclass_table import did_you_mean, field_types
-from lapgs_wgpu.train.presets import ABLATIONS, REMOVED, config_keys, load_config, preset_names
+from lapgs_wgpu.train.presets import ABLATIONS, config_keys, load_config, preset_names
 
 # Short names for the keys that are given most often.
 SHORTCUTS = {
@@ -107,8 +107,6 @@ def parse_options(arguments: list[str]) -> dict[str, typing.Any]:
     known, unknown = parser.parse_known_args(arguments)
     if unknown:
         word = unknown[0].split("=")[0]
-        if word.removeprefix("--") in REMOVED:
-            raise InputError(f"there is no option {word} any more: {REMOVED[word.removeprefix('--')]}.")
         options = [name for action in parser._actions for name in action.option_strings]
         what = f"there is no option {word}" if word.startswith("-") else f"{word!r} is one word too many"
         raise InputError(f"{what}{did_you_mean(word, options, '; lapgs-train --help lists the options.')}")

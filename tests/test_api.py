@@ -40,8 +40,8 @@ from lapgs_wgpu.splat.rotation import rotate, rotation_matrices
 from lapgs_wgpu.train.config import LossWeights, Rate
 from lapgs_wgpu.train.exchange_step import ExchangeStep
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
-from lapgs_wgpu.train.ground_truth import LEFT_OUT, upload_rgba
-from lapgs_wgpu.train.loss_terms import LossTerm, torch_loss
+from lapgs_wgpu.train.ground_truth import upload_rgba
+from lapgs_wgpu.train.parts import LossTerm, torch_loss
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.run_folder import load_state, save_state
 
@@ -402,14 +402,14 @@ def test_terms_of_ones_own_leave_out_what_the_losses_do(device: Device) -> None:
     rng, (height, width) = np.random.default_rng(0), (13, 21)
     planes = rng.random((4, height, width)).astype(np.float32)
     rgba = rng.integers(1, 256, (height, width, 4), np.uint8)
-    rgba[3:7, 5:] = LEFT_OUT
-    left_out = (rgba == LEFT_OUT).all(axis=2)
+    rgba[3:7, 5:, 3] = 0
+    left_out = rgba[..., 3] == 0
     shown, truth = DeviceArray.upload(device, "image", planes), upload_rgba(device, rgba)
     image = torch.from_numpy(planes[:3]).permute(1, 2, 0).double()
-    target = torch.from_numpy(lapgs_wgpu.data.views.composite(rgba, np.ones(3))).double() / 255
+    target = torch.from_numpy(rgba[..., :3]).double() / 255
     target[left_out] = image[left_out]
     expected = charbonnier(image, target).item()
-    in_torch, gradient = torch_loss(TorchLoss("mine", charbonnier), shown, truth, (1.0, 1.0, 1.0), 0.3)
+    in_torch, gradient = torch_loss(TorchLoss("mine", charbonnier), shown, truth, 0.3)
     assert in_torch == pytest.approx(expected, rel=1e-5)
     assert (gradient[:, left_out] == 0).all()
     assert (gradient[:3, ~left_out] != 0).all()

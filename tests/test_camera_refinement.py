@@ -17,6 +17,7 @@ from view_alignment import aligned_view
 
 from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.discovery.start_training import start_training
+from lapgs_wgpu.discovery.static_fit import static_config
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.camera import Camera
@@ -33,8 +34,8 @@ from lapgs_wgpu.train.camera_refinement import (
 from lapgs_wgpu.train.config import CamerasConfig, Rate
 from lapgs_wgpu.train.fused_loss import render_loss
 from lapgs_wgpu.train.ground_truth import upload_rgba
+from lapgs_wgpu.train.learners import restore_tensors
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.static_config import static_config
 from lapgs_wgpu.train.trainer import Trainer
 
 CONFIG = CamerasConfig("on", Rate(1e-2, 1e-2, 1), 0.0, 1)
@@ -230,7 +231,7 @@ def test_what_discovery_corrected_stays_corrected(device: Device, dataset: Datas
 def test_state_of_other_cameras_is_refused() -> None:
     state = refinement_of(cameras(4)).state()
     with pytest.raises(ValueError, match="camera learnt"):
-        refinement_of(cameras(5)).restore(state)
+        restore_tensors(refinement_of(cameras(5)).state(), state, "camera")
     state["square"] -= 1
     with pytest.raises(ValueError, match="negative"):
-        refinement_of(cameras(4)).restore(state)
+        restore_tensors(refinement_of(cameras(4)).state(), state, "camera")

@@ -149,7 +149,6 @@ MISTAKES = {
     "no data": (["tiny", "--out", "OUT"], "--data DIR"),
     "unknown preset": (["tinny", "--data", "SCENE", "--out", "OUT"], "did you mean tiny?"),
     "unknown option": (["tiny", "--data", "SCENE", "--out", "OUT", "--stesp", "5"], "did you mean --steps?"),
-    "removed option": (["tiny", "--data.split=val"], "--data.split any more"),
     "one word too many": (["tiny", "SCENE", "--out", "OUT"], "is one word too many"),
     "not a number": (["tiny", "--data", "SCENE", "--out", "OUT", "--steps", "x"], "must be a whole number, got 'x'"),
     "unknown device": (["tiny", "--data", "SCENE", "--out", "OUT", "--device", "GTX 9999"], "'GTX 9999'"),

@@ -22,7 +22,7 @@ from lapgs_wgpu.discovery.discover import RAMP_STEPS, discover
 from lapgs_wgpu.discovery.field_fit import fit_field
 from lapgs_wgpu.discovery.residual import Residual
 from lapgs_wgpu.discovery.start_training import start_training
-from lapgs_wgpu.discovery.static_fit import static_fit
+from lapgs_wgpu.discovery.static_fit import static_config, static_fit
 from lapgs_wgpu.discovery.surface_points import PointClouds, Points, surface_points
 from lapgs_wgpu.discovery.tracks import Tracks, find_tracks
 from lapgs_wgpu.discovery.trajectories import find_trajectories
@@ -38,7 +38,6 @@ from lapgs_wgpu.train.image_metrics import differing_pixels
 from lapgs_wgpu.train.optimizer import Optimizer
 from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.start import max_field_rates
-from lapgs_wgpu.train.static_config import static_config
 from lapgs_wgpu.train.trainer import Trainer
 
 RADIUS, BOX = 0.2, 1.3

@@ -19,6 +19,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.train.config import Rate
 from lapgs_wgpu.train.exposure import ExposurePasses, Exposures
+from lapgs_wgpu.train.learners import restore_tensors
 from lapgs_wgpu.train.trainer import Trainer
 
 CORRECTION = torch.tensor([[0.9, 0.1, -0.05, 0.02], [0.03, 1.2, 0.0, -0.1], [-0.02, 0.05, 0.8, 0.2]])
@@ -82,7 +83,7 @@ def test_a_state_of_other_pictures_is_refused(name: str) -> None:
     state = {key: value.detach().clone() for key, value in exposures.state().items()}
     for bad in (Exposures(2, RATE).state()[name], state[name].double(), state[name] + math.nan):
         with pytest.raises(ValueError, match=f"its exposure {name}"):
-            exposures.restore({**state, name: bad})
+            restore_tensors(exposures.state(), {**state, name: bad}, "exposure")
 
 
 def test_each_camera_of_a_rig_has_one_correction(dataset: Dataset, device: Device) -> None:

@@ -36,7 +36,9 @@ IGNORED[40, ::3] = True
 def test_the_loss_is_that_of_an_image_with_the_truth_in_the_ignored_pixels(device: Device, name: str) -> None:
     scene, other = gaussians(), gaussians()
     view = View("train_000", CAMERA, 0.0, "made up", lambda: TRUTH, ignored=lambda: IGNORED)
-    done = render_loss(scene, CAMERA, upload_rgba(device, marked_pixels(view, None)), BACKGROUND, WEIGHTS[name], device)
+    done = render_loss(
+        scene, CAMERA, upload_rgba(device, marked_pixels(view, BACKGROUND)), BACKGROUND, WEIGHTS[name], device
+    )
     done.loss.backward()
     drawn = rasterize(
         other.means, other.quats, other.scales, other.opacities, other.sh, CAMERA,

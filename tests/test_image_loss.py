@@ -23,7 +23,6 @@ from helpers.rounding import divides_exactly
 from helpers.scenes import relative
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.views import composite
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
@@ -39,7 +38,6 @@ from lapgs_wgpu.train.image_loss import ImageLoss
 pytestmark = pytest.mark.kernels
 
 SIZES = [(1, 1), (1, 9), (2, 5), (3, 3), (3, 4), (5, 70), (10, 13), (11, 11), (12, 30), (37, 61), (64, 64), (131, 90)]
-BLACK = (0.0, 0.0, 0.0)
 
 
 def structured_pair(height: int, width: int, flat: bool = True) -> Pair:
@@ -56,16 +54,14 @@ def structured_pair(height: int, width: int, flat: bool = True) -> Pair:
     return Pair(image.clip(0, 1).astype(np.float32), np.round(255 * truth).astype(np.uint8))
 
 
-def record(
-    losses: ImageLoss, pair: Pair, weights: LossWeights, background: tuple[float, float, float] = BLACK
-) -> tuple[NDArray[np.float32], Picture]:
+def record(losses: ImageLoss, pair: Pair, weights: LossWeights) -> tuple[NDArray[np.float32], Picture]:
     """Terms (5,) and gradient (H, W, 3)."""
     height, width = pair.image.shape[:2]
     planes = np.concatenate([pair.image.transpose(2, 0, 1), np.full((1, height, width), np.nan, np.float32)])
     image = DeviceArray.upload(losses.device, "image", planes)
     truth = upload_rgba(losses.device, pair.truth)
     with Commands(losses.device) as commands:
-        terms, d_image = losses.record(commands, image, truth, background, weights)
+        terms, d_image = losses.record(commands, image, truth, weights)
     planes = d_image.read()
     assert (planes[3] == 0).all()
     return terms.read(), planes[:3].transpose(1, 2, 0)
@@ -132,22 +128,6 @@ def test_equal_images(image_loss: ImageLoss, truth: NDArray[np.uint8]) -> None:
     np.testing.assert_allclose(terms, [0, 0, 0, 0, 0], atol=2e-3)  # NCC of flat windows: sqrt(tiny) / e
     np.testing.assert_allclose(terms[:4], 0, atol=1e-7)
     assert np.abs(gradient).max() < 1e-5
-
-
-@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.31, 0.77, 0.123)])
-def test_transparent_pictures_are_laid_on_the_background(
-    image_loss: ImageLoss, background: tuple[float, float, float]
-) -> None:
-    rng = np.random.default_rng(5)
-    rgba = rng.integers(0, 256, (64, 80, 4), np.uint8)
-    rgba[:8, :, 3], rgba[8:16, :, 3] = 0, 255
-    pair = Pair(np.zeros((64, 80, 3), np.float32), rgba)
-    terms, _ = record(image_loss, pair, WEIGHTS["l1"], background)
-    assert terms[0] == pytest.approx(composite(rgba, background).mean(dtype=float) / 255, rel=1e-6)
-    words = image_loss.pool.array("pixels", (10, 64, 8, 4), "uint32").read()  # in strips of 8 columns
-    pixels = words.view(np.uint8)
-    laid = pixels[..., 12:15].transpose(1, 0, 2, 3).reshape(64, 80, 3)
-    assert (laid == composite(rgba, background)).all()
 
 
 def test_the_same_bits_twice(image_loss: ImageLoss) -> None:

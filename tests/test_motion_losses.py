@@ -100,7 +100,7 @@ def test_it_rests_where_discovery_explains_what_moves(dataset: Dataset, device: 
         configure(acceleration__weight="1", acceleration__interval="1", schedule__warm_up="0"), dataset, device
     ) as training:
         assert training.step().terms["acceleration"] > 0
-        training._learners.field_fitted = True
+        training._learners.set_field_fitted(1.0)
         assert "acceleration" not in training.step().terms
 
 

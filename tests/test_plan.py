@@ -38,7 +38,9 @@ def plan(folder: Path, kind: str, seconds: dict[str, float], minutes: float | No
             raise DeviceMemoryError("too large")
         return step
 
-    return plan_training(folder, load_dataset(folder), FakeDevice(kind), minutes=minutes, measure=measure, **more)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("lapgs_wgpu.train.plan.step_seconds", measure)
+        return plan_training(folder, load_dataset(folder), FakeDevice(kind), minutes=minutes, **more)
 
 
 def test_a_cpu_device_gets_the_small_preset(folder: Path) -> None:

@@ -199,7 +199,7 @@ def test_train_goes_on_to_a_scene(
     write_capture(tmp_path / "walk", cameras, dark)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(plan, "LEAST_STEPS", 10)
-    monkeypatch.setitem(plan.plan_training.__kwdefaults__, "measure", lambda *_: 0.1)
+    monkeypatch.setattr(plan, "step_seconds", lambda *_: 0.1)
     assert prepare_command(["--check", "walk", "--train", "--minutes", "0.04"]) == 0
     said = capsys.readouterr().out.splitlines()
     (chosen,) = [line for line in said if line.startswith("training: ")]

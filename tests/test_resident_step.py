@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 import signal
 import subprocess
@@ -24,6 +25,7 @@ from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.data.views import View
 from lapgs_wgpu.errors import DeviceLostError, DeviceMemoryError, InputError
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.motion.fields.deformation import Nearby, TimeSamples
 from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.splat import buffer_plan
@@ -31,7 +33,7 @@ from lapgs_wgpu.splat.drawing import Drawing
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.resident_passes import Task
+from lapgs_wgpu.train.resident_passes import Recorded, ResidentPasses, Task
 from lapgs_wgpu.train.resident_step import Flying
 from lapgs_wgpu.train.run_folder import load_state
 from lapgs_wgpu.train.step_result import Scheduled, StepResult
@@ -91,15 +93,14 @@ def by_torch(trainer: Trainer, sample: Task, *, moving: bool) -> dict[str, Tenso
         nearby = Nearby(chosen, offsets, sample.near_time, smooth.static, smooth.temporal)
     if sample.even is not None:
         times = TimeSamples(sampled_rows.rows(sample.even), sample.even_times)
-    scheduled, background = Scheduled(4, moving, 1.0, seen=True), torch.tensor(sample.background)
-    trainer._exchange._descend(scheduled, sample.view, background, nearby, times)
+    trainer._exchange._descend(Scheduled(4, moving, 1.0, seen=True), sample.view, nearby, times)
     scene = trainer.scene
     named = {**scene.parameters, **(dict(scene.field.named_parameters()) if scene.field else {})}
     gradients = {name: torch.zeros_like(p) if p.grad is None else p.grad for name, p in named.items()}
     if trainer.cameras is not None:
         d_camera = trainer.cameras.values.grad.sum(dim=0).reshape(2, 3)
         gradients["cameras"] = torch.nn.functional.pad(d_camera, (0, 1)).flatten()
-        gradients["exposures"] = trainer._learners.exposures.values.grad.sum(dim=0).flatten()
+        gradients["exposure"] = trainer._learners.exposures.values.grad.sum(dim=0).flatten()
     return gradients
 
 
@@ -291,14 +292,12 @@ def test_a_step_that_is_not_finite_is_skipped_and_named(device: Device, dataset:
     states, told = [], []
     for waits in (False, True):
         trainer = started(config, dataset, device, "resident")
-        draws, results = trainer._draws, []
-        color = draws.background
-        for number in range(1, 13):
-            draws.background = torch.full((3,), torch.nan) if number == 7 else color
-            results.append(trainer.step())
+        spoil(trainer._resident._passes, at=7)
+        results = []
+        for result in trainer:
+            results.append(result)
             if waits:
                 trainer._resident.settle()
-        draws.background = color
         states.append(trainer.state())
         told.append([result.skipped for result in results])
     for skipped in told:
@@ -306,6 +305,18 @@ def test_a_step_that_is_not_finite_is_skipped_and_named(device: Device, dataset:
         assert "the loss term l1 is nan" in skipped[6].what
         assert "gradient of means" in skipped[6].what
     assert [name for name in states[0] if not np.array_equal(states[0][name], states[1][name])] == []
+
+
+def spoil(passes: ResidentPasses, at: int) -> None:
+    """Draw one of the steps on a background that is not finite."""
+    record, color = passes._recorded, passes._background
+
+    def spoiled(commands: Commands, task: Task, *rest: Any, **how: Any) -> Recorded:
+        passes._background = (math.nan,) * 3 if task.scheduled.step == at else color
+        passes._recordings.clear()
+        return record(commands, task, *rest, **how)
+
+    passes._recorded = spoiled
 
 
 def smaller(view: View) -> View:

@@ -148,7 +148,7 @@ def test_a_correction_that_fails_changes_nothing(
 ) -> None:
     """The state of the steps before can be saved."""
 
-    def lost(self: GroundTruth, view: View, color: Tensor) -> HostImage:
+    def lost(self: GroundTruth, view: View) -> HostImage:
         raise InputError("the disk is gone")
 
     monkeypatch.setattr(GroundTruth, "on_host", lost)
@@ -175,6 +175,6 @@ def test_it_sees_what_the_losses_see(dataset: Dataset, device: Device) -> None:
             training._learners.exposures.values[0, :, 3] += 0.25
         plain = training.scene.render(first.camera, first.time, torch.zeros(3)).image
         torch.testing.assert_close(training._picture(first, EVEN), plain + 0.25)
-        left_out = training._truth.on_host(first, torch.zeros(3)).left_out
+        left_out = training._truth.on_host(first).left_out
         assert bool(left_out[:5].all())
         assert not left_out[5:].any()

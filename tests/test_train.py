@@ -236,7 +236,7 @@ def test_nothing_moves_during_the_warm_up(dataset: Dataset, device: Device, tmp_
 def test_cross_correlation_counts_once_the_warm_up_is_over(
     dataset: Dataset, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With all losses and random backgrounds."""
+    """With all losses."""
     seen: list[tuple[LossWeights, RenderLoss]] = []
 
     def spy(*arguments: Any) -> RenderLoss:
@@ -244,7 +244,7 @@ def test_cross_correlation_counts_once_the_warm_up_is_over(
         return seen[-1][1]
 
     monkeypatch.setattr(exchange_step, "render_loss", spy)
-    options = {"loss__pyramid": "0.2", "loss__ncc": "0.05", "data__background": "random"}
+    options = {"loss__pyramid": "0.2", "loss__ncc": "0.05"}
     config = configure(schedule__steps="4", schedule__warm_up="2", **options)
     train(config, dataset, tmp_path / "run", device=device)
     assert [weights.ncc for weights, _ in seen] == [0, 0, 0.05, 0.05]

@@ -32,8 +32,8 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.lapgs_file import MAGIC
 from lapgs_wgpu.motion.timing import Timing
 from lapgs_wgpu.run import train
-from lapgs_wgpu.train.open_dataset import open_dataset, resolve_data
 from lapgs_wgpu.train.presets import load_config
+from lapgs_wgpu.train.setup import open_dataset, resolve_data
 from lapgs_wgpu.viewer import web_page
 from lapgs_wgpu.viewer.camera import ViewCamera
 from lapgs_wgpu.viewer.controls import ORBIT, ZOOM

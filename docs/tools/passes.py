@@ -24,8 +24,7 @@ from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.drawing import Drawing
 from lapgs_wgpu.splat.rasterize import rasterizer_of, upload_gaussians
 from lapgs_wgpu.splat.splat_layout import COLOR, MEAN, OPACITY, RADIUS
-from lapgs_wgpu.train.open_dataset import open_dataset, resolve_data
-from lapgs_wgpu.train.setup import resolve_for_dataset
+from lapgs_wgpu.train.setup import open_dataset, resolve_data, resolve_for_dataset
 
 Picture = NDArray[np.uint8]
 Floats = NDArray[np.float32]

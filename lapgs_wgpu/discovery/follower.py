@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.evenly import evenly_indices
-from lapgs_wgpu.discovery.residual import Floats
+from lapgs_wgpu.discovery.residual import Floats, cubic_grid
 from lapgs_wgpu.discovery.surface_points import Points, parts_of
 from lapgs_wgpu.discovery.trajectories import Trajectory
 
@@ -192,8 +192,7 @@ class Follower:
 
 def _grid(half: float, step: float) -> Floats:
     """(n, 3) places of a cubic grid of this spacing, up to `half` from 0 along each axis."""
-    axis = np.arange(-half, half + 1e-6, step, dtype=np.float32)
-    return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    return cubic_grid(np.arange(-half, half + 1e-6, step, dtype=np.float32))
 
 
 def _nearest(a: Floats, b: Floats) -> tuple[NDArray[np.uint8], Floats]:

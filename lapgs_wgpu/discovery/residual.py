@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,11 @@ Mask = NDArray[np.bool_]
 FALLOFF = 1.5  # pixels; standard deviation of the mask's soft border
 BLUR = 2.0  # pixels; standard deviation of the colors that views are compared by
 PARTLY = 0.3  # share of a thing that masks tell, from which on it is a mover
+
+
+def cubic_grid(axis: NDArray[Any]) -> NDArray[Any]:
+    """(n^3, 3) places of a cubic grid with these coordinates (n,) along each axis."""
+    return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 class Samples(NamedTuple):

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from lapgs_wgpu.discovery.residual import Floats, Residual
-from lapgs_wgpu.discovery.tracks import Tracks, parabolas
+from lapgs_wgpu.discovery.tracks import Tracks, all_of, parabolas
 from lapgs_wgpu.discovery.turns import harmonics, part_radius
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.splat.linear_light import directions
 from lapgs_wgpu.splat.rasterize import rasterize
 
 POINTS = 300  # of a body
@@ -51,7 +52,7 @@ def rigid_tracks(
     centers = torch.from_numpy(np.stack([tracks.paths[:, tracks.part == k].mean(axis=1) for k in parts], axis=1))
     soft_paths, soft_colors = torch.from_numpy(tracks.paths[:, others]), torch.from_numpy(tracks.colors[others])
     count = len(parts) * POINTS
-    points = _sphere(POINTS) * radii[:, None, None]
+    points = torch.from_numpy(directions(POINTS)).float() * radii[:, None, None]
     size = torch.log(SPACING * (4 * np.pi / POINTS) ** 0.5 * radii)[:, None].repeat(1, POINTS).ravel()
     soft_size = torch.full((int(others.sum()),), float(size.mean()))
     weights = {name: parabolas(times, np.ones(len(times)), spread) for name, spread in SPREADS.items()}
@@ -124,16 +125,13 @@ def _with_bodies(tracks: Tracks, stands: NDArray[np.int64], bodies: Mapping[int,
     """The tracks, with bodies in place of parts, by these their paths (T, POINTS, 3) and colors (POINTS, 3); their
     positions are those at the times where the parts were found."""
     others = ~np.isin(stands[tracks.part], list(bodies))
-    over_time = tracks.paths[:, others], tracks.supported[:, others]
-    parts = [(tracks.positions[others], tracks.colors[others], tracks.part[others], *over_time)]
+    parts = [tracks.rows(others)]
     for k, (paths, colors) in bodies.items():
         members = tracks.part == k
         away = np.linalg.norm(tracks.paths[:, members].mean(axis=1) - tracks.positions[members].mean(axis=0), axis=1)
         seen = np.repeat(tracks.supported[:, members][:, :1], POINTS, axis=1)
-        parts.append((paths[int(away.argmin())], colors, np.full(POINTS, k), paths, seen))
-    every = list(zip(*parts, strict=True))
-    positions, colors, part = (np.concatenate(values) for values in every[:3])
-    return Tracks(positions, colors, part, *(np.concatenate(values, axis=1) for values in every[3:]))
+        parts.append(Tracks(paths[int(away.argmin())], colors, np.full(POINTS, k), paths, seen))
+    return all_of(parts)
 
 
 def _shown(image: Residual, centers: Floats, radii: Floats) -> list[NDArray[np.bool_]]:
@@ -144,11 +142,3 @@ def _shown(image: Residual, centers: Floats, radii: Floats) -> list[NDArray[np.b
         image.mask & (np.hypot(columns - x, rows - y) < image.camera.K[0, 0] * radius / depth)
         for (x, y), depth, radius in zip(middles, np.maximum(depths, 1e-6), radii, strict=True)
     ]
-
-
-def _sphere(count: int) -> Tensor:
-    """(count, 3) points spread over the unit sphere, along a spiral."""
-    height = 1 - (2 * np.arange(count) + 1) / count
-    angle = np.pi * (1 + 5**0.5) * np.arange(count)
-    wide = np.sqrt(1 - height**2)
-    return torch.from_numpy(np.stack([wide * np.cos(angle), wide * np.sin(angle), height], axis=1)).float()

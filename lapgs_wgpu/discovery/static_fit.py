@@ -15,14 +15,39 @@ from lapgs_wgpu.discovery.residual import Floats, Residual
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.camera_refinement import Corrections
-from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config
+from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config, changed
 from lapgs_wgpu.train.exposure import without_exposure
-from lapgs_wgpu.train.static_config import static_config
 from lapgs_wgpu.train.trainer import Trainer
 
 MOST_VIEWS = 400  # of a capture, evenly chosen over the clip
 RIM = 2  # pixels around what moves that the fit does not look at, either
 SOLID = 0.5  # alpha from which on something is there
+# The schedule, in shares of its steps, and the rates are its own: what the static fit is sure of decides what is found.
+SCHEDULE = {
+    "schedule.sh_interval": 0.375,
+    "density.start": 0.375,
+    "density.stop": 0.875,
+    "density.interval": 0.125,
+    "density.contribution_interval": 0.3125,
+    "density.reset_interval": 1.0,
+}
+REFINE = 0.125  # from when on cameras move, at the latest
+# The learning rates are those of 3DGS; of the losses, L1 and SSIM are left.
+VALUES = {
+    "field.kind": "static",
+    "rates.log_scales": 5e-3,
+    "rates.quats": 1e-3,
+    "rates.sh_dc": 2.5e-3,
+    "rates.sh_rest": 1.25e-4,
+    "density.gradient": 5e-4,
+    "density.split": "plain",
+    "loss.pyramid": 0.0,
+    "loss.ncc": 0.0,
+    "loss.dynamics": 0.0,
+    "smoothness.share": 0.0,
+    "acceleration.weight": 0.0,
+    "step_place": "auto",
+}
 
 
 class StaticFit(NamedTuple):
@@ -34,6 +59,15 @@ class StaticFit(NamedTuple):
     images: list[Residual]
     depths: list[Floats] | None
     corrections: Corrections | None
+
+
+def static_config(config: Config) -> Config:
+    """The configuration of the static fit for a training."""
+    steps = config.discovery.steps
+    lengths = {key: max(1, round(share * steps)) for key, share in SCHEDULE.items()}
+    lengths |= dict.fromkeys(("schedule.steps", "schedule.warm_up", "rates.means.steps", "cameras.rate.steps"), steps)
+    lengths["cameras.start"] = min(config.cameras.start, max(1, round(REFINE * steps)))
+    return changed(config, VALUES | lengths)
 
 
 def static_fit(config: Config, dataset: Dataset, device: Device, progress: Callable[[int], None]) -> StaticFit:

@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from lapgs_wgpu.data.evenly import evenly_indices
-from lapgs_wgpu.discovery.residual import Floats, Residual
+from lapgs_wgpu.discovery.residual import Floats, Residual, cubic_grid
 
 RAYS = 300  # of an image, at most
 DEPTHS = 64  # that are tried along a ray
@@ -186,8 +186,7 @@ class _Always:
 
     def __init__(self, images: Sequence[Residual], half_side: float) -> None:
         self._half_side = half_side
-        axis = ((np.arange(GRID, dtype=np.float32) + 0.5) / GRID * 2 - 1) * half_side
-        places = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
+        places = cubic_grid(((np.arange(GRID, dtype=np.float32) + 0.5) / GRID * 2 - 1) * half_side).astype(np.float32)
         total, count = np.zeros(len(places), np.float32), np.zeros(len(places), np.float32)
         for image in images:
             samples = image.sample(places)

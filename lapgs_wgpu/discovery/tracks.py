@@ -61,8 +61,19 @@ class Tracks(NamedTuple):
         if not chosen.any():
             return None
         part = np.unique(self.part[chosen], return_inverse=True)[1].ravel()
-        paths, supported = self.paths[:, chosen], self.supported[:, chosen]
-        return Tracks(self.positions[chosen], self.colors[chosen], part, paths, supported)
+        return self.rows(chosen)._replace(part=part)
+
+    def rows(self, chosen: NDArray[np.bool_]) -> Tracks:
+        """The tracks (n,) that are set, with the numbers of their parts."""
+        of_time = self.paths[:, chosen], self.supported[:, chosen]
+        return Tracks(self.positions[chosen], self.colors[chosen], self.part[chosen], *of_time)
+
+
+def all_of(tracks: Sequence[Tracks]) -> Tracks:
+    """The tracks of several sets, at least one, in their order."""
+    positions, colors, part, paths, supported = zip(*tracks, strict=True)
+    of_time = np.concatenate(paths, axis=1), np.concatenate(supported, axis=1)
+    return Tracks(np.concatenate(positions), np.concatenate(colors), np.concatenate(part), *of_time)
 
 
 def find_tracks(clouds: PointClouds, half_side: float) -> Tracks | None:
@@ -123,13 +134,7 @@ def _tracks_by(many: float, clouds: PointClouds, trajectories: list[Trajectory],
     if not found:
         return None
     offsets = np.cumsum([0, *(tracks.part.max() + 1 for tracks in found[:-1])])
-    return Tracks(
-        np.concatenate([each.positions for each in found]),
-        np.concatenate([each.colors for each in found]),
-        np.concatenate([each.part + offset for each, offset in zip(found, offsets, strict=True)]),
-        np.concatenate([each.paths for each in found], axis=1),
-        np.concatenate([each.supported for each in found], axis=1),
-    )
+    return all_of([each._replace(part=each.part + offset) for each, offset in zip(found, offsets, strict=True)])
 
 
 def _key_time(clouds: list[Points], many: float, half_side: float) -> int | None:

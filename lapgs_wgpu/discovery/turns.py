@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from lapgs_wgpu.data.evenly import evenly_indices
-from lapgs_wgpu.discovery.residual import Floats, Residual
+from lapgs_wgpu.discovery.residual import Floats, Residual, cubic_grid
 from lapgs_wgpu.discovery.tracks import Tracks, parabolas
 
 Doubles = NDArray[np.float64]
@@ -178,8 +178,7 @@ def _turn_at(looks: list[_Look], key: int) -> tuple[Doubles, float]:
 
 def _grid(half: int) -> Doubles:
     """(n, 3) whole numbers from -half to half."""
-    axis = np.arange(-half, half + 1.0)
-    return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    return cubic_grid(np.arange(-half, half + 1.0))
 
 
 def _turns(looks: list[_Look]) -> Doubles:

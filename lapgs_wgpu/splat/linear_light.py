@@ -31,7 +31,7 @@ def sh_basis(directions: Floats, degree: int) -> Floats:
 def directions(count: int) -> Floats:
     """Return unit vectors (count, 3), spread evenly (Fibonacci's spiral)."""
     z = 1 - (2 * np.arange(count) + 1) / count
-    angle = np.pi * (3 - 5**0.5) * np.arange(count)
+    angle = np.pi * (1 + 5**0.5) * np.arange(count)
     radius = np.sqrt(1 - z * z)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
 

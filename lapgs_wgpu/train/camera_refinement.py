@@ -23,7 +23,6 @@ from torch import Tensor, nn
 
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.config import CamerasConfig
-from lapgs_wgpu.train.optimizer import restore_rows
 
 MEAN_DECAY = 0.5  # of a camera's momentum: it is seen a few dozen times
 SQUARE_DECAY = 0.98  # of the second moment, which all cameras share
@@ -212,10 +211,6 @@ class CameraRefinement:
     def state(self) -> dict[str, Tensor]:
         """Everything that the next step depends on, besides the gradient."""
         return {"learnt": self._learnt, "settled": self._settled, **self._descent.state()}
-
-    def restore(self, state: Mapping[str, Tensor]) -> None:
-        """Go on from what `state` gave. Raises ValueError where it is of other cameras."""
-        restore_rows(self.state(), state, "camera")
 
 
 def changed_camera(camera: Camera, change: Array) -> Camera:

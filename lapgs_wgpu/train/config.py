@@ -8,18 +8,20 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar
 
 from lapgs_wgpu.io.dataclass_table import Options, option
 from lapgs_wgpu.motion.fields.config import FieldConfig
 
-Background = Literal["black", "white", "random"]
-BACKGROUND_LEVELS = {"black": 0.0, "white": 1.0, "random": 0.0}  # under views that are measured
+Background = Literal["black", "white"]
+BACKGROUND_LEVELS = {"black": 0.0, "white": 1.0}
 Split = Literal["plain", "adaptive"]
 Units = Literal["world", "capture"]
 StepPlace = Literal["auto", "exchange", "resident"]
 RefineCameras = Literal["auto", "on", "off"]
+Table = TypeVar("Table", bound=Options)
 
 
 @dataclass(frozen=True)
@@ -27,9 +29,7 @@ class DataConfig(Options):
     """The capture."""
 
     size: int = option("longer side of the images, pixels; larger images are downscaled; 0: the original size")
-    background: Background = option(
-        "color behind the Gaussians and behind transparent images; random: a new one each step, black in evaluation"
-    )
+    background: Background = option("color behind the Gaussians and behind transparent images")
     cache_gb: float = option("memory limit for the images that are kept on the device, gigabytes")
     undistort: bool = option("resample images of lenses with distortion or skew to those of a pinhole camera", True)
     units: Units = option(
@@ -323,3 +323,12 @@ class Config(Options):
         "torch computes (fields other than static, grid4d and laplacian), else resident",
         "auto",
     )
+
+
+def changed(table: Table, values: Mapping[str, Any]) -> Table:
+    """A copy of a configuration, or of a table of it, with other values by dotted key, such as `schedule.steps`."""
+    for key, value in values.items():
+        name, _, rest = key.partition(".")
+        new = changed(getattr(table, name), {rest: value}) if rest else value
+        table = dataclasses.replace(table, **{name: new})  # type: ignore[type-var]
+    return table

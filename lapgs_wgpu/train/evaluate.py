@@ -46,7 +46,7 @@ def evaluate(
 ) -> dict[str, Any]:
     """Render every view and compare: the content of metrics.json.
 
-    background: black, white, or random, which is black here. folder: where a picture of each view is written, the
+    background: black or white. folder: where a picture of each view is written, the
     ground truth beside the rendering and their error, 4 times enlarged; an existing folder. lpips: None where there
     are no weights for it.
     Each measure is one of an image, then the mean over the images (of PSNR of the dB): psnr over all channels; ssim,

@@ -17,9 +17,9 @@ from lapgs_wgpu.train.density_control import DensityControl
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.ground_truth import AHEAD, GroundTruth
 from lapgs_wgpu.train.learners import Learners
-from lapgs_wgpu.train.loss_terms import LossTerm, Regularizer, weight_at
 from lapgs_wgpu.train.motion_losses import acceleration_loss, compared_counts, draw_nearby, draw_times
 from lapgs_wgpu.train.nonfinite import Skipped, cause, check_parameters, finite
+from lapgs_wgpu.train.parts import LossTerm, Regularizer, weight_at
 from lapgs_wgpu.train.step_result import Measured, Scheduled
 from lapgs_wgpu.train.view_order import Draws
 
@@ -52,11 +52,11 @@ class ExchangeStep:
         Raises NumericalError where a parameter is not finite.
         """
         step, draws = scheduled.step, self._draws
-        (view, background), drawn = draws.next(), draws.mark()
+        view, drawn = draws.next(), draws.mark()
         compared = self._compared(scheduled, self._scene.timing(view.time))
         self._truth.prefetch([view, *draws.coming(AHEAD)])
         self._learners.zero_grad()
-        measured, rendering = self._descend(scheduled, view, background, *compared)
+        measured, rendering = self._descend(scheduled, view, *compared)
         d_means2d = rendering.means2d.grad
         assert d_means2d is not None
         what = self._not_finite(measured, d_means2d, began)
@@ -85,7 +85,6 @@ class ExchangeStep:
         self,
         scheduled: Scheduled,
         view: View,
-        background: Tensor,
         nearby: Nearby | None,
         time_samples: TimeSamples | None,
     ) -> tuple[Measured, RenderLoss]:
@@ -100,7 +99,7 @@ class ExchangeStep:
             now.gaussians,
             learners.camera(view),
             self._truth.on_device(view),
-            background,
+            self._truth.color,
             weights,
             scene.device,
             learners.exposure(view),

@@ -6,7 +6,7 @@ applied to the rendered image before the losses, and never to a view that is mea
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -18,7 +18,6 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.train.config import Rate
-from lapgs_wgpu.train.optimizer import restore_rows
 
 MEAN_DECAY, SQUARE_DECAY = 0.9, 0.999  # Adam's
 EPS = 1e-15  # keeps 0 / 0 away
@@ -86,7 +85,7 @@ class Exposures:
     to the scene, which is measured without any: the mean of all stays the identity.
     """
 
-    name = "exposures"
+    name = "exposure"
 
     def __init__(self, count: int, rate: Rate) -> None:
         self._identity = torch.eye(3, 4)
@@ -114,7 +113,3 @@ class Exposures:
     def state(self) -> dict[str, Tensor]:
         """Everything that the next step depends on, besides the gradient."""
         return {"values": self.values, "mean": self._mean, "square": self._square, "steps": self._steps}
-
-    def restore(self, state: Mapping[str, Tensor]) -> None:
-        """Go on from what `state` gave. Raises ValueError where it is of other pictures."""
-        restore_rows(self.state(), state, "exposure")

@@ -21,7 +21,7 @@ from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.exposure import ExposurePasses
 from lapgs_wgpu.train.image_loss import ImageLoss
 from lapgs_wgpu.train.image_metrics import psnr_of
-from lapgs_wgpu.train.loss_terms import TorchLoss, torch_loss
+from lapgs_wgpu.train.parts import TorchLoss, torch_loss
 
 
 class RenderLoss(NamedTuple):
@@ -64,9 +64,9 @@ def render_loss(
     The same bits on every run of one adapter and driver. The gradients are always computed.
 
     gaussians: activated, float32, with harmonics. truth: (H, W) as `upload_rgba` leaves it, of the camera's size.
-    background: (3,) in [0, 1], under both; not differentiable. correction: (3, 4) of the image's colors before they are
-    compared (train/exposure). own: further terms of the image, with their weights. camera_change: (6,) zeros, which get
-    the gradient by a small change of the camera: rotation, shift in units of `camera_unit`, world units
+    background: (3,) in [0, 1], under the rendering; not differentiable. correction: (3, 4) of the image's colors before
+    they are compared (train/exposure). own: further terms of the image, with their weights. camera_change: (6,) zeros,
+    which get the gradient by a small change of the camera: rotation, shift in units of `camera_unit`, world units
     (splat.drawing.CameraGradient).
     """
     probe = gaussians.means.new_empty((len(gaussians), 2)).requires_grad_()
@@ -100,8 +100,12 @@ class _FusedLoss(torch.autograd.Function):
             d_rows = []
             with Commands(device) as commands:
                 image = drawing.image if corrections is None else exposing.record(commands, drawing.image, corrections)
-                terms, d_image = losses.record(commands, image, truth, background, weights)
-            own_values = _own_terms(own, image, truth, background, d_image)
+                terms, d_image = losses.record(commands, image, truth, weights)
+            own_values = []
+            for term, weight in own:
+                value, gradient = torch_loss(term, image, truth, weight)
+                own_values.append(value)
+                d_image.write(d_image.read() + gradient)
             if corrections is not None:
                 with Commands(device) as commands:
                     d_image, d_correction = exposing.record_bwd(commands, drawing.image, d_image, corrections)
@@ -132,19 +136,3 @@ class _FusedLoss(torch.autograd.Function):
     def backward(ctx: Any, *d_outputs: Any) -> tuple[Tensor | None, ...]:
         scaled = (None if gradient is None else d_outputs[0] * gradient for gradient in ctx.gradients)
         return (*scaled, None)
-
-
-def _own_terms(
-    own: Sequence[tuple[TorchLoss, float]],
-    image: DeviceArray,
-    truth: DeviceArray,
-    background: tuple[float, float, float],
-    d_image: DeviceArray,
-) -> list[float]:
-    """The values of the further terms of an image, whose weighted gradients are added to d_image (4, H, W)."""
-    values = []
-    for term, weight in own:
-        value, gradient = torch_loss(term, image, truth, background, weight)
-        values.append(value)
-        d_image.write(d_image.read() + gradient)
-    return values

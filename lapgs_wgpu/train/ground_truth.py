@@ -1,7 +1,7 @@
 """The images that a training compares its renderings with: decoded, composited and kept in one place.
 
-An image is prepared on the host once: laid on the background where that is one color, with the pixels marked that the
-losses leave out. It then stays on the device, from where the host reads it back where it needs it.
+An image is prepared on the host once: laid on the background, with the pixels marked that the losses leave out. It then
+stays on the device, from where the host reads it back where it needs it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from lapgs_wgpu.data.views import View, composite
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 
-LEFT_OUT = (1, 0, 0, 0)  # RGBA of a pixel that the losses leave out
 DECODERS = min(4, os.cpu_count() or 1)  # threads that decode images before they are needed
 
 AHEAD = 8  # images that are decoded before they are needed
@@ -30,12 +29,12 @@ AHEAD = 8  # images that are decoded before they are needed
 class GroundTruth:
     """The ground truth of training views. The most recently used images stay on the device.
 
-    color: (3,) in [0, 1] that transparent images are laid on; None where each step draws its own. max_bytes: bound on
-    what is kept on the device, 4 bytes a pixel. A larger image is given and not kept.
+    color: (3,) in [0, 1] that transparent images are laid on. max_bytes: bound on what is kept on the device, 4 bytes a
+    pixel. A larger image is given and not kept.
     """
 
-    def __init__(self, device: Device, color: Tensor | None, max_bytes: int) -> None:
-        self._device, self._color, self._max_bytes = device, color, max_bytes
+    def __init__(self, device: Device, color: Tensor, max_bytes: int) -> None:
+        self._device, self.color, self._max_bytes = device, color, max_bytes
         self._kept: OrderedDict[View, DeviceArray] = OrderedDict()
         self._coming: dict[View, Future[NDArray[np.uint8]]] = {}
         self._threads = ThreadPoolExecutor(DECODERS, thread_name_prefix="decode")
@@ -48,7 +47,7 @@ class GroundTruth:
     def prefetch(self, views: Iterable[View]) -> None:
         """Decode the images that are needed next, in the background; `on_device` raises what goes wrong there."""
         self._coming = {
-            view: self._coming.get(view) or self._threads.submit(marked_pixels, view, self._color)
+            view: self._coming.get(view) or self._threads.submit(marked_pixels, view, self.color)
             for view in views
             if view not in self._kept
         }
@@ -58,16 +57,16 @@ class GroundTruth:
         array = self._kept.pop(view, None)
         if array is None:
             coming = self._coming.pop(view, None)
-            array = upload_rgba(self._device, coming.result() if coming else marked_pixels(view, self._color))
+            array = upload_rgba(self._device, coming.result() if coming else marked_pixels(view, self.color))
         if array.buffer.nbytes <= self._max_bytes:
             while self.used_bytes + array.buffer.nbytes > self._max_bytes:
                 self._kept.popitem(last=False)
             self._kept[view] = array
         return array
 
-    def on_host(self, view: View, color: Tensor) -> HostImage:
-        """The image of a view on a background (3,). Raises InputError where it cannot be read."""
-        return host_image(self.on_device(view).read(), color)
+    def on_host(self, view: View) -> HostImage:
+        """The image of a view on the background. Raises InputError where it cannot be read."""
+        return host_image(self.on_device(view).read())
 
     def close(self) -> None:
         """End the decoding, and forget all images: what follows a training needs the memory."""
@@ -83,34 +82,26 @@ class HostImage(NamedTuple):
     left_out: Tensor
 
 
-def host_image(texels: NDArray[np.uint32], color: Tensor) -> HostImage:
-    """What `upload_rgba` brought to the device, (H, W), laid on a background (3,) in [0, 1]."""
+def host_image(texels: NDArray[np.uint32]) -> HostImage:
+    """What `upload_rgba` brought to the device, (H, W)."""
     rgba = texels.view(np.uint8).reshape(*texels.shape, 4)
-    image = composite(rgba, color.numpy()).astype(np.float32) / 255
-    return HostImage(torch.from_numpy(image), torch.from_numpy((rgba == LEFT_OUT).all(axis=2))[..., None])
+    image = rgba[..., :3].astype(np.float32) / 255
+    return HostImage(torch.from_numpy(image), torch.from_numpy(rgba[..., 3:] == 0))
 
 
-def marked_pixels(view: View, color: Tensor | None) -> NDArray[np.uint8]:
-    """The image of a view, (H, W, 3) RGB or (H, W, 4) straight RGBA in 8 bits, with ignored pixels marked.
-
-    A transparent pixel gets no color, whatever the file says: with red 1 it is left out of the losses
-    (shaders/common/on_background.wgsl), with 0 it counts. color: (3,) that a transparent image is laid on; None to keep
-    the transparency. Raises InputError where the image or its mask cannot be read.
-    """
+def marked_pixels(view: View, color: Tensor) -> NDArray[np.uint8]:
+    """The image of a view, laid on a color (3,): (H, W, 3) RGB, or (H, W, 4) with alpha 0 where the losses leave pixels
+    out, which get that color, whatever the file says. Raises InputError where the image or its mask cannot be read."""
     pixels, ignored = view.load(), view.load_ignored()
-    if color is not None:
-        pixels = composite(pixels, color.numpy())
-    if ignored is None and pixels.shape[2] == 3:
-        return pixels
+    if ignored is None:
+        return composite(pixels, color.numpy())
     rgba = _rgba(pixels)
-    rgba[rgba[..., 3] == 0] = 0
-    if ignored is not None:
-        rgba[ignored] = LEFT_OUT
-    return rgba
+    rgba[ignored] = 0
+    return np.dstack([composite(rgba, color.numpy()), np.where(ignored, 0, 255).astype(np.uint8)])
 
 
 def upload_rgba(device: Device, pixels: NDArray[np.uint8]) -> DeviceArray:
-    """(H, W) uint32 on the device, red in the lowest byte, of (H, W, 3) RGB or (H, W, 4) straight RGBA in 8 bits."""
+    """(H, W) uint32 on the device, red in the lowest byte, of (H, W, 3) RGB or (H, W, 4) RGBA in 8 bits."""
     return DeviceArray.upload(device, "truth", _rgba(pixels).view(np.uint32)[..., 0])
 
 

@@ -58,7 +58,6 @@ class ImageLoss:
         commands: Commands,
         image: DeviceArray,
         truth: DeviceArray,
-        background: tuple[float, float, float],
         weights: LossWeights,
     ) -> tuple[DeviceArray, DeviceArray]:
         """Compare an image with its ground truth.
@@ -66,12 +65,11 @@ class ImageLoss:
         Returns terms (5,) float32: L1, mean squared error, 1 - SSIM, pyramid, NCC; the last three 0 where their weight
         is 0; and the weighted loss's gradient (4, H, W) float32 by red, green, blue, and zeros.
 
-        image: planes (4, H, W) of float32, the first three red, green, blue. truth: (H, W) uint32, straight RGBA of 8
-        bits, red lowest. background: in [0, 1], under the ground truth, which is rounded to 8 bits, as
-        data/views.composite does. weights: of the terms.
+        image: planes (4, H, W) of float32, the first three red, green, blue. truth: (H, W) uint32, RGBA of 8 bits, red
+        lowest; pixels of alpha 0 are left out. weights: of the terms.
         """
         height, width = truth.shape
-        frame = _Frame(self, commands, height, width, background, weights)
+        frame = _Frame(self, commands, height, width, weights)
         pixels = frame.pixels(image, truth)
         extra = {}
         if weights.ssim:
@@ -108,7 +106,6 @@ class _Frame:
         commands: Commands,
         height: int,
         width: int,
-        background: tuple[float, float, float],
         weights: LossWeights,
     ) -> None:
         self.owner, self.commands, self.weights = owner, commands, weights
@@ -137,7 +134,7 @@ class _Frame:
         per_pixel = window / NCC_WINDOW**2
         kernel = Kernel.get(owner.device, "loss_pixels", LANES=owner._lanes)
         slope = (weights.l1 + self.flat_pyramid) * pixel, weights.ssim * pixel, weights.ncc * per_pixel, 0.0
-        given = {"size": (width, height), "run": owner._run, "background": background, "slope": slope}
+        given = {"size": (width, height), "run": owner._run, "slope": slope}
         given |= {"ssim_first": self.ends[1], "ncc_first": self.ends[3], "value": (pixel, pixel, window, 0.0)}
         self.picture = owner.pool.varying("picture", lambda: kernel.uniform("Picture", **given))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 
+import torch
 from torch import Tensor
 
 from lapgs_wgpu.data.views import Dataset, View
@@ -33,7 +34,7 @@ class Learners:
         self._groups = scene.field.parameter_groups() if scene.field else {}
         rates = parts.rates_of(config.rates.schedules(), scene.parameters, self._groups)
         self.optimizer = Optimizer(scene.parameters, self._groups, rates)
-        self.field_fitted = start.field_fitted
+        self.set_field_fitted(start.field_fitted)
         self.frequencies = None
         if scene.spectrum is not None:
             limit = nyquist_frequency(dataset)
@@ -66,14 +67,9 @@ class Learners:
         self.on_access()
         return self._exposures
 
-    @property
-    def field_fitted(self) -> float:
+    def set_field_fitted(self, fitted: float) -> None:
         """Not 0 where discovery fitted the field to nearly all that moves: its rates are then held low (`Start`)."""
-        return self._field_fitted
-
-    @field_fitted.setter
-    def field_fitted(self, fitted: float) -> None:
-        self._field_fitted = fitted
+        self.field_fitted = fitted
         self.optimizer.highest = max_field_rates(self._groups, fitted) if fitted else {}
 
     def camera(self, view: View) -> Camera:
@@ -113,24 +109,31 @@ class Learners:
 
     def state(self) -> dict[str, Mapping[str, Tensor]]:
         """Everything that the next step depends on, besides the scene and the gradients, by part."""
-        return {
-            "adam": self.optimizer.state(),
-            "frequencies": self.frequencies.state() if self.frequencies else {},
-            "exposure": exposures.state() if (exposures := self.exposures) else {},
-            "cameras": cameras.state() if (cameras := self.cameras) else {},
-        }
+        return {"adam": self.optimizer.state(), **{each.name: each.state() for each in self._refiners()}}
 
     def restore(self, state: Mapping[str, Mapping[str, Tensor]]) -> None:
         """Go on from what `state` gave. Raises KeyError or ValueError where it is of another training."""
         self.optimizer.restore(state.get("adam", {}))
-        if self.frequencies is not None:
-            self.frequencies.restore(state["frequencies"])
-        if (exposures := self.exposures) is not None:
-            exposures.restore(state["exposure"])
-        if (cameras := self.cameras) is not None:
-            cameras.restore(state["cameras"])
+        for each in self._refiners():
+            restore_tensors(each.state(), state[each.name], each.name)
 
     def _refiners(self) -> Iterator[Refiner]:
         for each in (self.frequencies, self.exposures, self.cameras):
             if each is not None:
                 yield each
+
+
+@torch.no_grad()
+def restore_tensors(mine: Mapping[str, Tensor], state: Mapping[str, Tensor], of: str) -> None:
+    """Copy a state that was stored into the tensors that are in use, a `square` and `steps` of Adam among them.
+
+    of: what the values are, for the text of a ValueError, which is raised where the state is of another training.
+    """
+    for name, value in mine.items():
+        other = state[name]
+        if other.shape != value.shape or other.dtype != value.dtype or not bool(other.isfinite().all()):
+            raise ValueError(f"its {of} {name} is {other.dtype} of shape {tuple(other.shape)}, or not finite")
+    if bool((state["square"] < 0).any() or (state["steps"] < 0).any()):
+        raise ValueError(f"its {of} moments are negative")
+    for name, value in mine.items():
+        value.copy_(state[name])

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.io.regular_file import open_regular
 from lapgs_wgpu.io.safetensors_file import unpack_tensors
 
 # VGG16's convolutions: number in torchvision's `features`, input and output channels; a tap after the last of each
@@ -32,11 +33,8 @@ class Lpips:
     """
 
     def __init__(self, weights: Path) -> None:
-        try:
-            with weights.open("rb") as file:
-                arrays, _ = unpack_tensors(file, weights.stat().st_size, str(weights))
-        except OSError as error:
-            raise InputError(f"{weights} cannot be read ({error.strerror}); --lpips-weights needs a file.") from None
+        with open_regular(weights) as file:
+            arrays, _ = unpack_tensors(file, weights.stat().st_size, str(weights))
         shapes: dict[str, tuple[int, ...]] = {}
         for k, block in enumerate(BLOCKS):
             for number, inputs, outputs in block:

@@ -143,8 +143,7 @@ class FrequencyOptimizer:
     def __init__(self, motion: LaplacianMotion, rate: Rate, limit: float) -> None:
         self._motion, self.rate, self.limit = motion, rate, limit
         self._mean = torch.zeros_like(motion.frequencies)
-        self._square = 0.0
-        self._steps = 0
+        self._square, self._steps = torch.zeros((), dtype=torch.float64), torch.tensor(0)
 
     name = "frequencies"
 
@@ -161,50 +160,24 @@ class FrequencyOptimizer:
             return
         gradient = self._motion.frequency_gradient()
         self._steps += 1
-        self._mean = 0.9 * self._mean + 0.1 * gradient
-        self._square = 0.999 * self._square + 0.001 * float(gradient.square().mean())
-        mean = self._mean / (1 - 0.9**self._steps)
-        size = (self._square / (1 - 0.999**self._steps)) ** 0.5
+        self._mean.copy_(0.9 * self._mean + 0.1 * gradient)
+        self._square.copy_(0.999 * self._square + 0.001 * float(gradient.square().mean()))
+        mean = self._mean / (1 - 0.9 ** int(self._steps))
+        size = (float(self._square) / (1 - 0.999 ** int(self._steps))) ** 0.5
         move = self.rate.at(step) * mean / (size + ADAM_EPS)
         frequencies.sub_(move.clamp(-LARGEST_FREQUENCY_STEP, LARGEST_FREQUENCY_STEP)).clamp_(0.0, self.limit)
         frequencies.grad = None
 
     def state(self) -> dict[str, Tensor]:
         """Everything that the next step depends on, besides the frequencies and their gradient."""
-        return {
-            "mean": self._mean,
-            "square": torch.tensor(self._square, dtype=torch.float64),
-            "steps": torch.tensor(self._steps),
-        }
-
-    def restore(self, state: Mapping[str, Tensor]) -> None:
-        """Go on from what `state` gave. Raises ValueError where it is of another spectrum."""
-        if state["mean"].shape != self._mean.shape or state["mean"].dtype != self._mean.dtype:
-            raise ValueError(f"its spectrum has {tuple(state['mean'].shape)} frequencies")
-        if not (float(state["square"]) >= 0 and int(state["steps"]) >= 0):
-            raise ValueError("its spectrum's moments are negative")
-        self._mean, self._square, self._steps = state["mean"], float(state["square"]), int(state["steps"])
+        return {"mean": self._mean, "square": self._square, "steps": self._steps}
 
     def packed(self) -> tuple[NDArray[np.float32], int]:
         """The first moments of all frequencies and the second one, (K + 1,), and how many steps have moved them."""
-        return np.append(self._mean.numpy(), np.float32(self._square)), self._steps
+        return np.append(self._mean.numpy(), np.float32(self._square)), int(self._steps)
 
     def unpack(self, moments: NDArray[np.float32], steps: int) -> None:
         """Go on from what `packed` gave."""
-        self._mean, self._square, self._steps = torch.from_numpy(moments[:-1].copy()), float(moments[-1]), steps
-
-
-@torch.no_grad()
-def restore_rows(mine: Mapping[str, Tensor], state: Mapping[str, Tensor], of: str) -> None:
-    """Copy a state that was stored into the tensors that are in use, a `square` and `steps` of Adam among them.
-
-    of: what the values are, for the text of a ValueError, which is raised where the state is of another training.
-    """
-    for name, value in mine.items():
-        other = state[name]
-        if other.shape != value.shape or other.dtype != value.dtype or not bool(other.isfinite().all()):
-            raise ValueError(f"its {of} {name} is {other.dtype} of shape {tuple(other.shape)}, or not finite")
-    if bool((state["square"] < 0).any() or (state["steps"] < 0).any()):
-        raise ValueError(f"its {of} moments are negative")
-    for name, value in mine.items():
-        value.copy_(state[name])
+        self._mean.copy_(torch.from_numpy(moments[:-1]))
+        self._square.fill_(float(moments[-1]))
+        self._steps.fill_(steps)

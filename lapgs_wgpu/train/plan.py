@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
+import operator
 import statistics
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.errors import DeviceMemoryError, InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.progress import duration
-from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.open_dataset import open_dataset
+from lapgs_wgpu.train.config import Config, changed
 from lapgs_wgpu.train.presets import load_config
+from lapgs_wgpu.train.setup import open_dataset
 from lapgs_wgpu.train.start import start_from_points
 from lapgs_wgpu.train.trainer import Trainer
 
@@ -35,6 +34,13 @@ LEAST_STEPS = 250  # below, nothing can be recognized
 # Time of a whole training by the time of its steps: motion discovery, growing numbers of Gaussians and the evaluation
 # take 10 to 90 % more.
 WHOLE = 1.5
+# Keys of the lengths of a schedule that are 1 step at least.
+LENGTHS = (
+    *(f"rates.{name}.steps" for name in ("means", "hash", "mlp", "frequencies")),
+    *("schedule.warm_up", "schedule.sh_interval", "exposure.rate.steps", "cameras.start", "cameras.rate.steps"),
+    *(f"density.{name}" for name in ("start", "stop", "interval", "reset_interval", "contribution_interval")),
+    *("timing.start", "timing.interval", "discovery.steps", "discovery.field_steps"),
+)
 UNTIMED_STEPS, TIMED_STEPS = 4, 8  # the first ones compile kernels; multiples of acceleration.interval
 
 
@@ -73,15 +79,14 @@ def plan_training(
     *,
     minutes: float | None = None,
     exposure: bool = False,
-    measure: Callable[[Config, Dataset, Device], float] = step_seconds,
 ) -> Plan:
     """Choose the training of a capture: a small preset on a CPU device; on others a large one, where its schedule, or
     most of it, fits into the time. Its steps are those of its schedule, more where the clip has many times, fewer where
     the time is short.
 
     opened: the capture of the folder, with images of any size. minutes: that the training may take, about; None for the
-    whole schedule. exposure: whether to learn a color correction for each image. measure: times a step, seconds. Raises
-    InputError where the capture is not usable, or the time is too short for anything.
+    whole schedule. exposure: whether to learn a color correction for each image. Raises InputError
+    where the capture is not usable, or the time is too short for anything.
     """
     if minutes is not None and not 0 < minutes < math.inf:
         raise InputError(f"--minutes must be above 0, got {minutes:g}.")
@@ -93,10 +98,10 @@ def plan_training(
         last = preset == small
         config = load_config(preset, {"data.path": str(folder.resolve()), "exposure.enabled": exposure})
         # No densification beyond twice the initial number, so that the measured step tells of the whole training.
-        config = dataclasses.replace(config, density=dataclasses.replace(config.density, limit=2 * config.points.count))
+        config = changed(config, {"density.limit": 2 * config.points.count})
         dataset = open_dataset(config)
         try:
-            step = measure(config, dataset, device)
+            step = step_seconds(config, dataset, device)
         except DeviceMemoryError:
             if last:
                 raise
@@ -124,20 +129,7 @@ def plan_training(
 def scale_schedule(config: Config, steps: int) -> Config:
     """The configuration with `steps` steps, and all its schedules as much shorter or longer."""
     factor = steps / config.schedule.steps
-
-    def scaled(table: Any, *names: str) -> Any:
-        return dataclasses.replace(table, **{name: max(1, round(factor * getattr(table, name))) for name in names})
-
-    rates = {name: scaled(rate, "steps") for name, rate in vars(config.rates).items() if hasattr(rate, "steps")}
-    smoothness = dataclasses.replace(config.smoothness, start=round(factor * config.smoothness.start))
-    return dataclasses.replace(
-        config,
-        schedule=dataclasses.replace(scaled(config.schedule, "warm_up", "sh_interval"), steps=steps),
-        rates=dataclasses.replace(config.rates, **rates),
-        density=scaled(config.density, "start", "stop", "interval", "reset_interval", "contribution_interval"),
-        smoothness=smoothness,
-        exposure=dataclasses.replace(config.exposure, rate=scaled(config.exposure.rate, "steps")),
-        cameras=dataclasses.replace(scaled(config.cameras, "start"), rate=scaled(config.cameras.rate, "steps")),
-        timing=scaled(config.timing, "start", "interval"),
-        discovery=scaled(config.discovery, "steps", "field_steps"),
+    scaled = {key: max(1, round(factor * operator.attrgetter(key)(config))) for key in LENGTHS}
+    return changed(
+        config, scaled | {"schedule.steps": steps, "smoothness.start": round(factor * config.smoothness.start)}
     )

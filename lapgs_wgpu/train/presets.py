@@ -38,27 +38,6 @@ ABLATIONS: dict[str, tuple[str, str, Any]] = {
     "appearance": ("color changes over time", "field.appearance", "none"),
 }
 
-# Keys of earlier versions, and what holds now. In a .toml file they are ignored, with a note.
-REMOVED = {
-    "acceleration.frames": "it is 2",
-    "cameras.focal": "focal lengths are taken as they are",
-    "data.split": "a run is measured on its test views",
-    "decoder": "it is in torch where the step is, and on the device where that is; step_place says which",
-    "density.divergence_weight": "it is 0.5",
-    "density.max_screen_radius": "density.max_world_size bounds sizes",
-    "density.neighbours": "it is 10",
-    "density.reset_opacity": "it is 0.01",
-    "density.split_quantile": "it is 0.4",
-    "density.split_size": "it is 0.01",
-    "eval.snapshots": "only the last model is saved",
-    "eval.tensorboard": "log.jsonl has the figures",
-    "eval.views": "the validation views are measured, or 8 training views if there are none",
-    "loss.dynamics_mode": "the regularization is that of the paper's equation; loss.dynamics 0 turns it off",
-    "points.opacity": "it is 0.1",
-    "precision": "it is float32",
-    "schedule.batch": "a step takes one image",
-}
-
 _SCENES = "published-scenes"  # the file with presets of single scenes
 
 
@@ -93,10 +72,12 @@ def load_config(
     base = _read(preset)
     for key, value in {**_shorthands(method, ablate), **(overrides or {})}.items():
         if key not in known:
-            hint = f" any more: {REMOVED[key]}." if key in REMOVED else did_you_mean(key, known)
-            raise InputError(f"there is no key {key!r}{hint}")
+            raise InputError(f"there is no key {key!r}{did_you_mean(key, known)}")
         texts = isinstance(value, str) or (isinstance(value, list) and all(isinstance(each, str) for each in value))
-        _set(base, key, from_text(value, known[key]) if texts else value)
+        parsed = from_text(value, known[key]) if texts else value
+        for part in reversed(key.split(".")):
+            parsed = {part: parsed}
+        base = _merge(base, parsed)
     return build_dataclass(Config, base, preset, advice=ADVICE)
 
 
@@ -156,14 +137,13 @@ def _read(preset: str, seen: tuple[str, ...] = ()) -> Table:
 
 
 def _read_file(path: str) -> Table:
-    """The table of a file, such as a run's config.toml, without keys of earlier versions."""
+    """The table of a file. That of a run, which an earlier version may have written, loses keys that are gone."""
     if not Path(path).is_file():
         raise InputError(f"{path} does not exist; give a preset ({', '.join(preset_names())}) or a .toml file.")
     table = read_toml(Path(path))
-    table.pop("record", None)  # what a run noted about itself
-    removed = [key for key in REMOVED if _remove(table, key)]
-    if removed:
-        print(f"note: {path}: ignores {', '.join(removed)}, which this version has no more.", file=sys.stderr)
+    of_a_run = table.pop("record", None) is not None
+    if of_a_run and (gone := _remove_unknown(table, Config)):
+        print(f"note: {path}: ignores {', '.join(gone)}, which this version does not know.", file=sys.stderr)
     return table
 
 
@@ -184,15 +164,16 @@ def _packaged() -> dict[str, Table]:
     return presets | presets.pop(_SCENES)
 
 
-def _remove(table: Any, key: str) -> bool:
-    """Remove a dotted key from a nested table, if it is there; whether it was."""
-    section, _, rest = key.partition(".")
-    if not isinstance(table, dict) or section not in table:
-        return False
-    if rest:
-        return _remove(table[section], rest)
-    del table[section]
-    return True
+def _remove_unknown(table: Table, cls: type, prefix: str = "") -> list[str]:
+    """Remove the keys from a nested table that a dataclass lacks; their dotted names."""
+    types, gone = field_types(cls), []
+    for name, value in list(table.items()):
+        if name not in (*types, "base"):
+            del table[name]
+            gone.append(f"{prefix}{name}")
+        elif isinstance(value, dict) and dataclasses.is_dataclass(types.get(name)):
+            gone += _remove_unknown(value, types[name], f"{prefix}{name}.")
+    return gone
 
 
 def _merge(below: Table, above: Table) -> Table:
@@ -202,14 +183,6 @@ def _merge(below: Table, above: Table) -> Table:
         both = isinstance(value, dict) and isinstance(below.get(key), dict)
         merged[key] = _merge(below[key], value) if both else value
     return merged
-
-
-def _set(table: Table, key: str, value: Any) -> None:
-    *path, name = key.split(".")
-    for part in path:
-        inner = table.get(part)
-        table[part] = table = dict(inner) if isinstance(inner, dict) else {}
-    table[name] = value
 
 
 def _toml_lines(table: Mapping[str, Any], prefix: str) -> Iterator[str]:

@@ -28,7 +28,7 @@ _PLACES = {
         "square": (_ALL, slice(0, 1)),
         "moves": (_ALL, slice(1, 2)),
     },
-    "exposures": {
+    "exposure": {
         "values": (_EVERY, slice(0, 12)),
         "mean": (_EVERY, slice(12, 24)),
         "square": (_EVERY, slice(24, 36)),
@@ -53,7 +53,7 @@ class ResidentCorrections:
             common[:, : self._cameras.common.shape[1]] = self._cameras.common
             self._common = self._pool.upload("common motions", common.numpy())
         if self._exposures is not None:
-            self._add("exposures", (len(self._exposures.values), _EXPOSURE_FLOATS), self._exposures)
+            self._add("exposure", (len(self._exposures.values), _EXPOSURE_FLOATS), self._exposures)
         self._d_camera, self._d_exposure = self._pool.array("d_camera", (8,)), self._pool.array("d_exposure", (12,))
         self.on_host = True
 
@@ -107,13 +107,13 @@ class ResidentCorrections:
         """Record the image with its colors corrected."""
         if self._exposures is None:
             return image
-        return self._exposing.record(commands, image, self._value("exposures"), self._first_row)
+        return self._exposing.record(commands, image, self._value("exposure"), self._first_row)
 
     def expose_bwd(self, commands: Commands, image: DeviceArray, d_exposed: DeviceArray) -> DeviceArray:
         """Record the gradient by the image, and that by the correction of its colors."""
         if self._exposures is None:
             return d_exposed
-        values = self._value("exposures")
+        values = self._value("exposure")
         d_image, d_rows = self._exposing.record_bwd(commands, image, d_exposed, values, self._first_row)
         sum_columns(commands, self._pool, d_rows, self._d_exposure, columns=12)
         return d_image
@@ -144,7 +144,7 @@ class ResidentCorrections:
             count, rate = len(exposures.values), exposures.rate.at(self._step)
             return kernel.uniform("ExposureStep", number=self._numbers[self._view.name], count=count, rate=rate)
 
-        arrays = {"guard": guard, "d_exposure": self._d_exposure, "exposures": self._value("exposures")}
+        arrays = {"guard": guard, "d_exposure": self._d_exposure, "exposures": self._value("exposure")}
         commands.dispatch(kernel, 1, descent=self._pool.varying("exposure step", write), **arrays)
 
     def _step_camera(self, commands: Commands, guard: DeviceArray, frame: DeviceArray, geometry: DeviceArray) -> None:
@@ -171,7 +171,7 @@ class ResidentCorrections:
 
     def _gradients(self) -> dict[str, DeviceArray]:
         found = {"cameras": self._d_camera} if self.moves_camera else {}
-        return found | ({"exposures": self._d_exposure} if self._exposures is not None else {})
+        return found | ({"exposure": self._d_exposure} if self._exposures is not None else {})
 
     def _value(self, name: str) -> DeviceArray:
         return self._blocks[name][0].arrays["value"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 from lapgs_wgpu.data.views import View
 from lapgs_wgpu.gpu.array import DeviceArray
@@ -20,7 +20,7 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.drawing import Drawing, GaussianGradients
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterizer_of
-from lapgs_wgpu.train.config import Config, LossWeights
+from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config, LossWeights
 from lapgs_wgpu.train.fused_loss import image_loss_of
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.resident_corrections import ResidentCorrections
@@ -37,7 +37,7 @@ class Task:
     """A resident step to be taken.
 
     scheduled: what the schedule says. before, drawn: where the draws stood before its view and before its samples.
-    view: of the training, on a background (3,). time: of the field. sh_degree: of the harmonics in use. rates: of the
+    view: of the training. time: of the field. sh_degree: of the harmonics in use. rates: of the
     optimizer's groups, and of the frequencies. near, near_time: the places and the time that the smoothness loss
     compares; None in steps without it. even, even_times: those of the acceleration loss. counts: how many steps had
     moved each tensor before.
@@ -47,7 +47,6 @@ class Task:
     before: Mark
     drawn: Mark
     view: View
-    background: tuple[float, float, float]
     time: float
     sh_degree: int
     rates: dict[str, float]
@@ -59,11 +58,8 @@ class Task:
     counts: dict[str, int] = field(default_factory=dict)
 
 
-class Recorded(NamedTuple):
-    """The passes of a step. told: what is read of it later."""
-
-    drawing: Drawing
-    told: list[DeviceArray]
+# The passes of a step: its drawing, and what is read of it later.
+Recorded = tuple[Drawing, list[DeviceArray]]
 
 
 class ResidentPasses:
@@ -82,7 +78,8 @@ class ResidentPasses:
         self.rasterizer, self._losses = rasterizer_of(scene.device), image_loss_of(scene.device)
         self._pool = BufferPool(scene.device)
         self._recordings: dict[tuple[Any, ...], tuple[Recording, Recorded]] = {}
-        self._checked = False
+        level = BACKGROUND_LEVELS[config.data.background]
+        self._background, self._checked = (level, level, level), False
         self.dynamics_loss = bool(config.loss.dynamics) and scene.field_config.dynamics_size > 0
         self._task: Task
 
@@ -134,13 +131,13 @@ class ResidentPasses:
         camera, plan = task.view.camera, self.rasterizer.plan_of(task.view.camera)
         shape = (
             *(task.scheduled.moving, task.scheduled.seen, task.near is None, task.even is None, judged),
-            *(task.sh_degree, task.background, camera.width, camera.height, plan, len(self._scene)),
+            *(task.sh_degree, camera.width, camera.height, plan, len(self._scene)),
             self.corrections.moves_camera,
         )
         self._recordings = {key: each for key, each in self._recordings.items() if each[0].holds}
         if shape in self._recordings:
             recording, step = self._recordings[shape]
-            step.drawing.camera = camera
+            step[0].camera = camera
             commands.replay(recording)
             return step
         if self._device.textures:  # copies to them depend on what was done before
@@ -159,15 +156,15 @@ class ResidentPasses:
         decodings = self._decode(commands, task)
         drawn = self._activate(commands, task.sh_degree, decodings[0] if decodings else None)
         corrections, weights = self.corrections, self.weights(task)
-        drawing = self.rasterizer.record(commands, drawn, task.view.camera, task.background, corrections.move)
+        drawing = self.rasterizer.record(commands, drawn, task.view.camera, self._background, corrections.move)
         image = corrections.expose(commands, drawing.image)
-        terms, d_image = self._losses.record(commands, image, truth, task.background, weights)
+        terms, d_image = self._losses.record(commands, image, truth, weights)
         d_image = corrections.expose_bwd(commands, drawing.image, d_image)
         by_drawn = self.rasterizer.record_bwd(commands, drawing, d_image, camera=corrections.moves_camera)
         corrections.sum_camera(commands, by_drawn.camera)
         self._record_bwd(commands, drawn, by_drawn, decodings, totals)
         self._record_end(commands, task, drawing, by_drawn, terms, judged=judged)
-        return Recorded(drawing, [guard, bad, terms, totals, *drawing.needed])
+        return drawing, [guard, bad, terms, totals, *drawing.needed]
 
     def _decode(self, commands: Commands, task: Task) -> tuple[Decoding, Comparison | None, Line | None] | None:
         """Record the field; what varies from step to step is asked for anew."""

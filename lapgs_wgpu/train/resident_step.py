@@ -154,12 +154,10 @@ class ResidentStep:
 
     def _task(self, scheduled: Scheduled, sh_degree: int) -> Task:
         step, draws, frequencies = scheduled.step, self._draws, self._learners.frequencies
-        before, (view, background), drawn = draws.mark(), draws.next(), draws.mark()
-        red, green, blue = background.tolist()
+        before, view, drawn = draws.mark(), draws.next(), draws.mark()
         rates, time = self._learners.optimizer.rates_at(step, scheduled.share), self._scene.timing(view.time)
         frequency_rate = frequencies.rate.at(step) if frequencies else 0.0
-        color = red, green, blue
-        task = Task(scheduled, before, drawn, view, color, time, sh_degree, rates, frequency_rate)
+        task = Task(scheduled, before, drawn, view, time, sh_degree, rates, frequency_rate)
         if self._passes.moves:
             self._draw(task, draws.generator)
         self._truth.prefetch([view, *draws.coming(AHEAD)])

@@ -19,6 +19,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.io.folder_lock import LOCK
 from lapgs_wgpu.io.listing import listed
+from lapgs_wgpu.io.regular_file import open_regular
 from lapgs_wgpu.io.safe_json_toml import read_toml
 from lapgs_wgpu.io.safetensors_file import pack_tensors, unpack_tensors
 from lapgs_wgpu.train.config import Config
@@ -142,13 +143,8 @@ def load_state(out: Path) -> dict[str, NDArray[Any]] | None:
     path = out / STATE
     if not path.exists():
         return None
-    if not path.is_file():  # a pipe would block
-        raise InputError(f"{path}: is not a regular file")
-    try:
-        with path.open("rb") as file:
-            return unpack_tensors(file, path.stat().st_size, str(path))[0]
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    with open_regular(path) as file:
+        return unpack_tensors(file, path.stat().st_size, str(path))[0]
 
 
 def check_state(state: State, *, views: int, steps: int) -> None:

@@ -1,18 +1,19 @@
-"""What a training is given, checked; and what its configuration leaves to the data and the device."""
+"""What a training is given, opened and checked; and what its configuration leaves to the data and the device."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+import operator
 from pathlib import Path
 
-from lapgs_wgpu.data.views import Dataset
+from lapgs_wgpu.data import Dataset, load_dataset
+from lapgs_wgpu.data.built_in import SYNTHETIC, write_built_in
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.motion.timing import MOST_TIMES
-from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.open_dataset import open_dataset, resolve_data
+from lapgs_wgpu.train.config import Config, changed
 from lapgs_wgpu.train.parts import Parts
 
 
@@ -47,7 +48,7 @@ def set_up(
         config = dataclasses.replace(config, field=scene.field_config)
     elif parts.field is not None:
         try:
-            config = dataclasses.replace(config, field=dataclasses.replace(config.field, kind="own"))
+            config = changed(config, {"field.kind": "own"})
         except ValueError as error:
             raise InputError(f"{error}.") from None
     user_config = resolve_step(config, device, parts)
@@ -55,6 +56,29 @@ def set_up(
     if scene is not None:  # whose field does not change its shape any more
         resolved = dataclasses.replace(resolved, field=scene.field_config)
     return user_config, resolved, dataset, device
+
+
+def resolve_data(config: Config, scenes: Path) -> Config:
+    """The configuration with the absolute paths of its data. scenes: folder into which the built-in scene is written,
+    unless it is there. Raises InputError."""
+    path = config.data.path
+    if not path:
+        raise InputError(f"the configuration names no data; give --data DIR (in Python data.path), or {SYNTHETIC}.")
+    folder = write_built_in(scenes / SYNTHETIC) if path == SYNTHETIC else Path(path)
+    masks = str(Path(config.data.masks).resolve()) if config.data.masks else ""
+    return changed(config, {"data.path": str(folder.resolve()), "data.masks": masks})
+
+
+def open_dataset(config: Config) -> Dataset:
+    """The dataset of a configuration whose path is a folder's. Raises InputError."""
+    data = config.data
+    return load_dataset(
+        data.path,
+        image_size=data.size or None,
+        undistort=data.undistort,
+        masks=data.masks or None,
+        movers=data.movers or None,
+    )
 
 
 def resolve_for_dataset(config: Config, dataset: Dataset) -> Config:
@@ -67,21 +91,13 @@ def resolve_for_dataset(config: Config, dataset: Dataset) -> Config:
             f"{dataset.name} has {len(dataset.times)} times, and timing.refine takes {MOST_TIMES} at most; give "
             "--timing.refine false."
         )
-    field = config.field
     if config.data.units == "capture":
-        scale, means = dataset.scale, config.rates.means
-        field = dataclasses.replace(field, bound=scale * field.bound, unit=scale * field.unit)
-        config = dataclasses.replace(
-            config,
-            data=dataclasses.replace(config.data, units="world"),
-            rates=dataclasses.replace(
-                config.rates, means=dataclasses.replace(means, start=scale * means.start, end=scale * means.end)
-            ),
-            smoothness=dataclasses.replace(config.smoothness, reach=scale * config.smoothness.reach),
-        )
+        lengths = ("field.bound", "field.unit", "rates.means.start", "rates.means.end", "smoothness.reach")
+        scaled = {key: dataset.scale * operator.attrgetter(key)(config) for key in lengths}
+        config = changed(config, {**scaled, "data.units": "world"})
     # All frequencies above the limit would end there.
-    most = 1 + math.floor(nyquist_frequency(dataset) / field.frequency_step + 1e-9)
-    return dataclasses.replace(config, field=dataclasses.replace(field, components=min(field.components, most)))
+    most = 1 + math.floor(nyquist_frequency(dataset) / config.field.frequency_step + 1e-9)
+    return changed(config, {"field.components": min(config.field.components, most)})
 
 
 def nyquist_frequency(dataset: Dataset) -> float:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -104,16 +103,14 @@ class Trainer:
 
     def _prepare(self, start: Start) -> None:
         config, scene, dataset = self.config, self.scene, self.dataset
-        self._color = torch.full((3,), BACKGROUND_LEVELS[config.data.background])  # of measurements
-        color = None if config.data.background == "random" else self._color
+        color = torch.full((3,), BACKGROUND_LEVELS[config.data.background])
         self._truth = GroundTruth(scene.device, color, int(config.data.cache_gb * 1e9))
-        self._draws = Draws(dataset.train, self._generator, color)
+        self._draws = Draws(dataset.train, self._generator)
         self._learners = Learners(config, dataset, self.parts, start)
         self._density = DensityControl(config, scene, self._learners, self.parts.density, dataset, self._generator)
         self.timing = None
         if config.timing.refine and scene.field is not None and len(dataset.times) > 2:
-            truth = partial(self._truth.on_host, color=self._color)
-            self.timing = TimingRefinement(scene, dataset.train, truth, self._picture, dataset.time_gap)
+            self.timing = TimingRefinement(scene, dataset.train, self._truth.on_host, self._picture, dataset.time_gap)
         self._timing_steps = config.timing.corrections(config.schedule.steps) if self.timing else []
         self._skipped = 0  # steps in a row
         shared = self._learners, self._density, self._truth, self._draws
@@ -252,7 +249,9 @@ class Trainer:
     @torch.no_grad()
     def _picture(self, view: View, timing: Timing) -> Tensor:
         """The scene's picture (H, W, 3) of a training view, with the corrections of its camera and of its colors."""
-        image = self.scene.render(self._learners.camera(view), view.time, self._color, depth=False, timing=timing).image
+        image = self.scene.render(
+            self._learners.camera(view), view.time, self._truth.color, depth=False, timing=timing
+        ).image
         correction = self.exposure_of(view)
         return image if correction is None else image @ correction[:, :3].T + correction[:, 3]
 
@@ -307,7 +306,7 @@ class Trainer:
         own = parts["training"]
         self.done, scene.sh_degree = int(own["done"]), int(own["sh_degree"])
         self.warm_up_steps, self._ramp_steps = int(own["warm_up"]), int(own["rising"])
-        self._learners.field_fitted = float(own["field_fitted"])
+        self._learners.set_field_fitted(float(own["field_fitted"]))
         self._generator.set_state(own["random"])
         self._draws.left = own["order"].tolist()
         self._plans.set_bands(self._drawn, int(own["bands"]))

@@ -21,20 +21,18 @@ class Mark(NamedTuple):
 class Draws:
     """What the steps of a training draw: views in random order without replacement, epoch after epoch.
 
-    background: (3,) under every image; None for a new one in each step. left: the numbers of the views that are still
-    to come in this epoch.
+    left: the numbers of the views that are still to come in this epoch.
     """
 
-    def __init__(self, views: Sequence[View], generator: torch.Generator, background: Tensor | None) -> None:
-        self._views, self.generator, self.background = views, generator, background
+    def __init__(self, views: Sequence[View], generator: torch.Generator) -> None:
+        self._views, self.generator = views, generator
         self.left: list[int] = []
 
-    def next(self) -> tuple[View, Tensor]:
-        """The next view, and the background (3,) that its image lies on."""
+    def next(self) -> View:
+        """The next view."""
         if not self.left:
             self.left = torch.randperm(len(self._views), generator=self.generator).tolist()
-        view = self._views[self.left.pop(0)]
-        return view, torch.rand(3, generator=self.generator) if self.background is None else self.background
+        return self._views[self.left.pop(0)]
 
     def coming(self, count: int) -> list[View]:
         """At most so many views that come after it in this epoch."""

@@ -3,7 +3,6 @@ struct Picture {
     size: vec2<u32>,         // width, height
     run: u32,                // pixels that a lane takes one after another, down a column or along a row
     ssim_first: u32,         // where the partial sums of these terms begin
-    background: vec3<f32>,   // under the ground truth
     ncc_first: u32,
     value: vec4<f32>,        // a pixel's share in each term: L1 and squared error, SSIM, a window's in NCC, -
     slope: vec4<f32>,        // the same, times the term's weight in the loss
