@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from lapgs_wgpu.data.initial_gaussians import first_points
-from lapgs_wgpu.data.validation import check_in_view, check_times
+from lapgs_wgpu.data.validation import check_in_view, check_spacing, check_times
 from lapgs_wgpu.data.views import Dataset, spread_views
 from lapgs_wgpu.discovery.start_training import start_training
 from lapgs_wgpu.errors import DeviceError, InputError, NumericalError, quoted
@@ -75,7 +75,7 @@ def train(
     out = Path(out)
     if not dataset.test:
         raise InputError(f"{dataset.name} has no test view, by which a run is measured; add images to the capture.")
-    found = check_times(dataset, moving=config.field.kind != "static")
+    found = check_times(dataset, moving=config.field.kind != "static") + check_spacing(dataset)
     found += check_in_view(dataset, first_points(dataset, PROBES, config.points.box, config.seed)[0])
     check_run_folder(out, overwrite=overwrite)
     keep_freed_memory()

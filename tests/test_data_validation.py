@@ -21,7 +21,7 @@ from lapgs_wgpu.data.timestamps import (
     held_out,
     in_step,
 )
-from lapgs_wgpu.data.validation import check_film, check_in_view, check_times, check_views
+from lapgs_wgpu.data.validation import check_film, check_in_view, check_spacing, check_times, check_views
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
@@ -99,6 +99,18 @@ def test_all_times_equal(device: Device, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--field static"):
         train(load_config("tiny", FAST, method="mlp"), data, tmp_path / "mlp", device=device)
     assert not (tmp_path / "mlp").exists()
+
+
+@pytest.mark.parametrize(("count", "told"), [(4, "4 still cameras are 90 degrees apart"), (16, "")])
+def test_still_cameras_far_apart(count: int, told: str) -> None:
+    ring = [
+        Camera.looking_at(
+            [3 * np.cos(a), 3 * np.sin(a), 0.0], np.zeros(3), up=[0.0, 0.0, 1.0], fov_x=0.9, width=8, height=8
+        )
+        for a in 2 * np.pi * np.arange(count) / count
+    ]
+    found = check_spacing(timed(np.linspace(0, 1, 2 * count), taken=2 * ring))
+    assert found == [] if not told else told in found[0]
 
 
 def test_cameras_that_look_away_for_a_while(device: Device, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

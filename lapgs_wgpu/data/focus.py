@@ -15,6 +15,7 @@ Array = NDArray[np.float64]
 ROUNDING = 1e-9  # relative to coordinates: what tells them apart by less is no distance
 PARALLEL = 1e-2  # mean squared sine between optical axes below which they do not determine a point
 ITERATIONS = 20  # of the reweighted least squares
+FAR_APART = 30.0  # degrees between neighbouring still cameras, beyond which none confirms another one's depths
 
 
 def spread(cameras: Sequence[Camera]) -> float:
@@ -27,6 +28,15 @@ def spread(cameras: Sequence[Camera]) -> float:
 def are_parallel(cameras: Sequence[Camera]) -> bool:
     """Whether all look in one direction, as one camera that stands still does: their axes meet nowhere."""
     return bool(np.linalg.eigvalsh(_across(cameras).mean(axis=0))[0] < PARALLEL)
+
+
+def degrees_apart(cameras: Sequence[Camera], focus: NDArray[np.floating]) -> float:
+    """The angle between a camera and the nearest other one, seen from what they look at (3,): the median over them; 0
+    for one camera."""
+    rays = np.stack([camera.position - focus for camera in cameras])
+    rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
+    nearest = np.sort(np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1))), axis=1)[:, 1:2]
+    return float(np.median(nearest)) if nearest.size else 0.0
 
 
 def focus_of(cameras: Sequence[Camera], *, origin: bool) -> Array:

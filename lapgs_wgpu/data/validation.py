@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lapgs_wgpu.data.capture_files import MOST_ABSENT
 from lapgs_wgpu.data.cloud import Cloud, in_view, views_of
 from lapgs_wgpu.data.evenly import evenly
-from lapgs_wgpu.data.focus import spread
+from lapgs_wgpu.data.focus import FAR_APART, degrees_apart, spread
 from lapgs_wgpu.data.frames import Frame
 from lapgs_wgpu.data.images import BLURRED, EQUAL, ImageFile, Size, blurred_and_repeated, decode, size_text
 from lapgs_wgpu.data.lens import Lens
@@ -252,6 +252,18 @@ def check_in_view(dataset: Dataset, points: NDArray[np.floating]) -> list[str]:
         f"{dataset.name}: all cameras look away at {len({view.time for view in blind})} of {len(dataset.times)} times: "
         f"{_named([view.name for view in blind])} show nothing of the scene, so its motion there is a guess; check "
         "these poses, or remove these images."
+    ]
+
+
+def check_spacing(dataset: Dataset) -> list[str]:
+    """Warn about still cameras too far apart for views between them."""
+    apart = degrees_apart(dataset.cameras, dataset.focus) if dataset.is_rig else 0.0
+    if apart <= FAR_APART:
+        return []
+    return [
+        f"{dataset.name}: {len(dataset.cameras)} still cameras are {apart:.0f} degrees apart, seen from what they look "
+        f"at, over {FAR_APART:g}: none confirms another one's depths, so views between them show blobs; add cameras "
+        "between them."
     ]
 
 

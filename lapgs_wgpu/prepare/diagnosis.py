@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from lapgs_wgpu.data import Dataset, View, load_dataset
 from lapgs_wgpu.data.cloud import in_view, points_in_view
 from lapgs_wgpu.data.evenly import evenly
+from lapgs_wgpu.data.focus import FAR_APART, degrees_apart
 from lapgs_wgpu.data.images import Pixels
 from lapgs_wgpu.data.masks import Mask, decode_mask
 from lapgs_wgpu.data.readers.colmap import IMAGES
@@ -195,16 +196,12 @@ def coverage(looks: Sequence[Look]) -> Measure:
 
 
 def spacing(cameras: Sequence[Camera], focus: Floats) -> Measure:
-    """Of cameras that stand still: the angle between one and the nearest other one, seen from what they look at (3,),
-    the median over them."""
-    rays = np.stack([camera.position - focus for camera in cameras])
-    rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
-    nearest = np.sort(np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1))), axis=1)[:, 1:2]
-    degrees = float(np.median(nearest)) if nearest.size else 0.0
+    """Of cameras that stand still, how far they stand apart, seen from what they look at (3,)."""
+    degrees = degrees_apart(cameras, focus)
     advice = "put more cameras between them: so far apart none confirms the depths that another one sees, and views "
     advice += "between them, such as the held-out one, show blobs"
     value = f"{degrees:.0f} degrees from a camera to the nearest other one"
-    return Measure("spacing", degrees, value, 0, 30, "30 or less", advice)
+    return Measure("spacing", degrees, value, 0, FAR_APART, f"{FAR_APART:g} or less", advice)
 
 
 def exposure(looks: Sequence[Look], points: Floats | None) -> Measure:
