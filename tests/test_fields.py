@@ -215,7 +215,7 @@ def test_smoothness_of_planes_sees_bends_only(device: Device) -> None:
             plane.copy_(torch.ones_like(plane) if PLANES[number % 6][1] == 3 else slope.expand_as(plane))
     straight = field(POINTS, 0.3, None, NEARBY).smoothness
     assert straight is not None
-    assert float(straight) < 1e-12
+    assert straight.item() < 1e-12
     with torch.no_grad():
         field.planes[3][0, 0, 4, 2] += 0.5  # x, t
     bent = field(POINTS, 0.3, None, NEARBY).smoothness

@@ -1,7 +1,7 @@
 """The images that a training compares its renderings with: decoded, composited and kept in one place.
 
-An image is prepared on the host once: laid on the background, with the pixels marked that the losses leave out. It then
-stays on the device, from where the host reads it back where it needs it.
+The host prepares an image once: it composites it over the background and marks the pixels that the losses leave out.
+The image then stays on the device; the host reads it back where it needs it.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ AHEAD = 8  # images that are decoded before they are needed
 class GroundTruth:
     """The ground truth of training views. The most recently used images stay on the device.
 
-    color: (3,) in [0, 1] that transparent images are laid on. max_bytes: bound on what is kept on the device, 4 bytes a
-    pixel. A larger image is given and not kept.
+    color: (3,) in [0, 1], the background behind transparent images. max_bytes: of the images that are kept on the
+    device, 4 bytes a pixel. A larger image is returned, but not kept.
     """
 
     def __init__(self, device: Device, color: Tensor, max_bytes: int) -> None:
@@ -90,8 +90,8 @@ def host_image(texels: NDArray[np.uint32]) -> HostImage:
 
 
 def marked_pixels(view: View, color: Tensor) -> NDArray[np.uint8]:
-    """The image of a view, laid on a color (3,): (H, W, 3) RGB, or (H, W, 4) with alpha 0 where the losses leave pixels
-    out, which get that color, whatever the file says. Raises InputError where the image or its mask cannot be read."""
+    """Return the image of a view over a background color (3,): (H, W, 3) RGB; or, where the losses leave pixels out,
+    (H, W, 4), in which these have that color and alpha 0. Raises InputError where image or mask cannot be read."""
     pixels, ignored = view.load(), view.load_ignored()
     if ignored is None:
         return composite(pixels, color.numpy())
