@@ -222,7 +222,7 @@ def test_smoothness_of_planes_sees_bends_only(device: Device) -> None:
     assert bent is not None
     values = 4 * 8 * 6
     squares = 0.5**2 * (1 + 4 + 1) / (4 * 6 * 6)  # second differences 0.5, -1, 0.5 among 4 features x 6 x 6
-    assert float(bent) == pytest.approx(1e-2 * squares + 1e-4 * 0.5 / values, rel=1e-4)
+    assert bent.item() == pytest.approx(1e-2 * squares + 1e-4 * 0.5 / values, rel=1e-4)
 
 
 # The baselines
