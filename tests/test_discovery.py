@@ -430,7 +430,7 @@ def test_a_training_draws_a_scene_that_it_starts_from_as_it_is_drawn(dataset: Da
 def test_rates_rise_after_discovery(
     started: tuple[str, dict[str, np.ndarray]], dataset: Dataset, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And on from where they were in a training that is resumed."""
+    """And on from where they were in a training that is resumed; over the last steps they fall."""
     shares: list[float] = []
     step = Optimizer.step
 
@@ -441,12 +441,12 @@ def test_rates_rise_after_discovery(
     monkeypatch.setattr(Optimizer, "step", noted)
     ramp = configure().schedule.warm_up or RAMP_STEPS
     state = started[1]
-    for _ in range(2):
-        with Trainer(configure(), dataset, device) as training:
+    for config in (configure(), configure(), configure(schedule__steps="4", schedule__cool_down="500")):
+        with Trainer(config, dataset, device) as training:
             training.restore(state)
             training.step()
             state = training.state()
-    assert shares == pytest.approx([1 / ramp, 2 / ramp])
+    assert shares == pytest.approx([1 / ramp, 2 / ramp, 2 / 500])
 
 
 def test_a_field_that_knows_the_tracks_learns_slowly_also_when_resumed(

@@ -196,8 +196,8 @@ class Trainer:
         return result
 
     def _step(self) -> StepResult:
-        step, rising = self.done + 1, self._ramp_steps
-        moving, share = step > self.warm_up_steps, min(1.0, step / rising) if rising else 1.0
+        step = self.done + 1
+        moving, share = step > self.warm_up_steps, self._share_of_rates(step)
         # Before this step draws: both may wait for steps in flight, which may draw again.
         if self._resident is not None:
             self._resident.make_room()
@@ -222,6 +222,12 @@ class Trainer:
         if self._resident is None:
             self._note(measured().skipped)
         return StepResult(step, self.config.schedule.steps, measured)
+
+    def _share_of_rates(self, step: int) -> float:
+        """Which share of its learning rates a step has: they rise over the first steps, and fall over the last."""
+        rising, falling = self._ramp_steps, self.config.schedule.cool_down
+        left = self.config.schedule.steps - step + 1
+        return min(1.0, step / rising if rising else 1.0, left / falling if falling else 1.0)
 
     def _note(self, skipped: Skipped | None) -> None:
         """Take in whether a step was skipped. Raises NumericalError where too many in a row were."""
