@@ -7,7 +7,7 @@ rotations that are chained through the film. What moves stays unexplained, and w
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,11 +23,10 @@ FIT = 2.5e-3  # of the longer side: a match up to this residual is explained
 FAR = 6  # images apart: near images of a camera that walks look turned, too
 
 
-@dataclass(frozen=True, eq=False)
-class Pan:
-    """rotations: (n, 3, 3), world to camera (x right, y down). focal: pixels. radial: first
-    coefficient. explained: share of the matches of images at least FAR apart (of all, in a shorter film). travel:
-    pixels that the middle of the image moves between two images at most."""
+class Pan(NamedTuple):
+    """rotations: (n, 3, 3), world to camera (x right, y down). focal: pixels. radial: first coefficient.
+    explained: share of the matches of images at least FAR apart (of all, in a shorter film). travel: pixels that the
+    middle of the image moves between two images at most."""
 
     rotations: Floats
     focal: float
@@ -114,12 +113,13 @@ def _chained(s: _Sample, count: int, focal: float, sigma: float) -> Floats:
 def _refined(s: _Sample, R: Floats, focal: float, sigma: float) -> tuple[Floats, float, float, Floats]:
     """Levenberg-Marquardt with the loss e / (1 + e), e = (residual / sigma)^2. Returns rotations, focal length, radial
     coefficient and the residuals (m,) in pixels."""
-    from scipy.spatial.transform import Rotation  # slow to import
+    from scipy.sparse import csr_array  # slow to import
+    from scipy.spatial.transform import Rotation
 
     n, radial, damping = len(R), 0.0, 1e-3
     ray, seen, r = _residuals(s, R, focal, radial)
-    index = np.concatenate([3 * s.a[:, None] + np.arange(3), 3 * s.b[:, None] + np.arange(3)], axis=1)
-    index = np.concatenate([index, np.tile([3 * n, 3 * n + 1], (len(r), 1))], axis=1)
+    turns = 3 * np.stack([s.a, s.b], axis=1)[:, :, None] + np.arange(3)
+    columns = np.column_stack([turns.reshape(-1, 6), np.tile([3 * n, 3 * n + 1], (len(r), 1))]).repeat(2, axis=0)
 
     def cost(r: Floats) -> float:
         e = np.square(r).sum(axis=1) / sigma**2
@@ -134,12 +134,11 @@ def _refined(s: _Sample, R: Floats, focal: float, sigma: float) -> tuple[Floats,
         by_point[:, :, 2] = -focal * seen[:, :2] * inverse[:, None] ** 2
         by_focal = (_residuals(s, R, focal * 1.0001, radial)[2] - r) / 1e-4  # of its logarithm
         by_radial = (_residuals(s, R, focal, radial + 1e-4)[2] - r) / 1e-4
-        by_a = by_point @ (R[s.b] @ R[s.a].transpose(0, 2, 1)) @ _cross(ray)
-        J = np.concatenate([by_a, -by_point @ _cross(seen), by_focal[:, :, None], by_radial[:, :, None]], axis=2)
-        J = J * weight[:, None, None]
-        H, gradient = np.zeros((3 * n + 2, 3 * n + 2)), np.zeros(3 * n + 2)
-        np.add.at(H, (index[:, :, None], index[:, None, :]), np.einsum("mki,mkj->mij", J, J))
-        np.add.at(gradient, index, np.einsum("mki,mk->mi", J, r * weight[:, None]))
+        by_a = np.cross(by_point @ (R[s.b] @ R[s.a].transpose(0, 2, 1)), ray[:, None])
+        by_b = np.cross(seen[:, None], by_point)
+        rows = np.concatenate([by_a, by_b, by_focal[:, :, None], by_radial[:, :, None]], axis=2) * weight[:, None, None]
+        J = csr_array((rows.ravel(), columns.ravel(), np.arange(0, rows.size + 1, 8)), shape=(2 * len(r), 3 * n + 2))
+        H, gradient = (J.T @ J).toarray(), J.T @ (r * weight[:, None]).ravel()
         H[:3], H[:, :3], gradient[:3] = 0, 0, 0  # the first image stays
         H[range(3), range(3)] = 1
         H[-1, -1] += 1e3  # a lens without distortion, unless the matches say otherwise
@@ -160,10 +159,3 @@ def _refined(s: _Sample, R: Floats, focal: float, sigma: float) -> tuple[Floats,
         if gain < 1e-5 * now:
             break
     return R, focal, radial, np.linalg.norm(r, axis=1)
-
-
-def _cross(v: Floats) -> Floats:
-    """(m, 3, 3) matrices of the cross products with (m, 3)."""
-    x, y, z = v.T
-    o = np.zeros(len(v))
-    return np.stack([o, -z, y, z, o, -x, -y, x, o], axis=1).reshape(-1, 3, 3)
