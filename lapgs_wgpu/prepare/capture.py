@@ -113,7 +113,7 @@ def _moving_camera(
     known = None if poses is None else _known(names, poses, size)
     lenses = "SINGLE" if known is None or len(set(known[0].values())) == 1 else "PER_IMAGE"
     source = Reconstruction(folder / IMAGES, names, work, LENS if known is None else "OPENCV", lenses)
-    matches = source.match(neighbouring_pairs(names), source.find_features())
+    matches = source.match(neighbouring_pairs(names))
     if given is not None:
         rest = without(matches, source.places, given, size)
         before, after = (sum(map(len, each.values())) for each in (matches, rest))

@@ -57,17 +57,13 @@ class Reconstruction:
             camera = database.read_all_cameras()[0]
         self.prior, self.exif = float(camera.mean_focal_length()), bool(camera.has_prior_focal_length)
 
-    def find_features(self) -> dict[str, Plane]:
-        """Find the features of all images, whose places are kept; returns their descriptors (`sift`)."""
-        found = {}
+    def match(self, pairs: Sequence[Pair]) -> dict[Pair, Ints]:
+        """Find the features of all images, whose places are kept, match those of pairs, and verify the matches."""
+        descriptors = {}
         with self.database() as database:
             for name in counted(self.names, len(self.names), "images searched for features"):
-                self.places[name], found[name] = sift(self.images / name)
+                self.places[name], descriptors[name] = sift(self.images / name)
                 database.write_keypoints(self.ids[name], self.places[name])
-        return found
-
-    def match(self, pairs: Sequence[Pair], descriptors: Mapping[str, Plane]) -> dict[Pair, Ints]:
-        """Match the features of pairs of images, and verify the matches."""
         numbered = counted(pairs, len(pairs), "pairs of images matched")
         matches = {(one, other): nearest(descriptors[one], descriptors[other]) for one, other in numbered}
         self.use(matches)
@@ -92,8 +88,7 @@ class Reconstruction:
     def verified(self) -> dict[Pair, Ints]:
         """The matches that an epipolar geometry explains, of pairs that share enough of them."""
         with self.database() as database:
-            names = {image.image_id: image.name for image in database.read_all_images()}
-            found = {}
+            names, found = {number: name for name, number in self.ids.items()}, {}
             for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
                 one, other = (names[i] for i in self._colmap.pair_id_to_image_pair(pair))
                 if len(geometry.inlier_matches) >= FEWEST_MATCHES:
