@@ -68,9 +68,10 @@ def search(source: Reconstruction, size: Size, *, rival: bool = False) -> Found 
         longest = max(longest, spent.seconds - started)
         if found is not None and (best is None or _rank(source, found) > _rank(source, best)):
             best = found
-        enough = best is not None and len(best.placed) >= GOOD * len(source.names)
-        if best is not None and enough and (rival or (number and _good(best, size))):
-            break  # the first one alone may be wrong, and no measure of it tells
+        if best is not None and len(best.placed) >= GOOD * len(source.names):
+            good = not best.faults and best.error < max(1.0, SHARP * max(size))
+            if rival or (number and good):
+                break  # the first one alone may be wrong, and no measure of it tells
         if found is not None:
             rest = max(left + started - spent.seconds, 0) * spent.slower
             more = f"{len(found.faults)} faults of the path; " * bool(found.faults)
@@ -148,10 +149,6 @@ def again(source: Reconstruction, found: Found, matches: Match, masks: Mapping[s
     seconds = SECONDS + SECONDS_EACH * len(source.names)
     model = source.solve(found.focal, together=found.together, held=found.held, seconds=seconds)
     return described(source, model, together=found.together, held=found.held)
-
-
-def _good(found: Found, size: Size) -> bool:
-    return not found.faults and found.error < max(1.0, SHARP * max(size))
 
 
 def _rank(source: Reconstruction, found: Found) -> tuple[float, float, float]:
