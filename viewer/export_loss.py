@@ -52,17 +52,23 @@ def measure(scene: LoadedScene, written: Written, time: float | None = None, fra
     pictures have then.
     """
     rasterizer = Rasterizer(scene.playback.device)
+
+    def drawn(gaussians: Gaussians[DeviceArray], camera: Camera) -> Floats:
+        """An image (3, height, width), clipped to [0, 1]."""
+        return rasterizer.draw_whole(gaussians, camera, scene.background).image.read()[:3].clip(0, 1)
+
     if time is None and not scene.playback.moves:
         time = 0.0
     pictures, captured = [], scene.initial_view.camera
     size = captured.width, captured.height
     for camera, t in orbit_views(scene.camera(), size, _PICTURES, time, scene.initial_view.arc):
         t = t if frames is None else round(t * (frames - 1)) / max(1, frames - 1)
-        wanted = _draw(rasterizer, scene, scene.playback.at(t), camera)
-        psnr = _psnr(wanted, _draw(rasterizer, scene, written(camera, t)[0], camera))
-        pictures.append((psnr, camera, t, wanted))
+        wanted = drawn(scene.playback.at(t), camera)
+        pictures.append((_psnr(wanted, drawn(written(camera, t)[0], camera)), camera, t, wanted))
     psnr, camera, t, wanted = min(pictures, key=lambda picture: picture[0])
-    return Loss(psnr, "" if psnr >= _VISIBLE else _reason(rasterizer, scene, written, camera, t, wanted))
+    if psnr >= _VISIBLE:
+        return Loss(psnr, "")
+    return Loss(psnr, _reason(scene, written, camera, t, lambda gaussians: _psnr(wanted, drawn(gaussians, camera))))
 
 
 def of_playback(playback: Playback, rows: Rows | None = None) -> Written:
@@ -71,34 +77,24 @@ def of_playback(playback: Playback, rows: Rows | None = None) -> Written:
     return lambda camera, t: (playback.at(t), held)
 
 
-def _draw(
-    rasterizer: Rasterizer, scene: LoadedScene, gaussians: Gaussians[DeviceArray], camera: Camera
-) -> NDArray[np.float32]:
-    """Draw an image (3, height, width), clipped to [0, 1]."""
-    image: NDArray[np.float32] = rasterizer.draw_whole(gaussians, camera, scene.background).image.read()
-    return image[:3].clip(0, 1)
-
-
 def _psnr(true: Floats, found: Floats) -> float:
     error = float(np.mean((found.astype(np.float64) - true) ** 2))
     return min(100.0, -10 * math.log10(max(error, 1e-20)))
 
 
 def _reason(
-    rasterizer: Rasterizer, scene: LoadedScene, written: Written, camera: Camera, t: float, wanted: Floats
+    scene: LoadedScene, written: Written, camera: Camera, t: float, psnr_of: Callable[[Gaussians[DeviceArray]], float]
 ) -> str:
     """Which property, taken from the scene, brings the picture nearest to the scene's, and how many Gaussians differ in
-    it."""
+    it. psnr_of: of a picture from this camera against the scene's, dB."""
     device = scene.playback.device
     shown, rows = written(camera, t)
     exact = scene.playback.at(t)
     true = {name: array.read()[rows] for name, array in exact.arrays().items()}
     gains = {}
     for name, values in true.items():
-        mended = Gaussians(**(shown.arrays() | {name: upload(device, values)}), antialiased=shown.antialiased)
-        gains[name] = _psnr(wanted, _draw(rasterizer, scene, mended, camera))
-    mended = dataclasses.replace(shown, antialiased=exact.antialiased)
-    if _psnr(wanted, _draw(rasterizer, scene, mended, camera)) > max(gains.values()):
+        gains[name] = psnr_of(dataclasses.replace(shown, **{name: upload(device, values)}))
+    if psnr_of(dataclasses.replace(shown, antialiased=exact.antialiased)) > max(gains.values()):
         return "the scene is drawn antialiased, which the file does not say"
     name = max(gains, key=gains.__getitem__)
     found = {name: array.read() for name, array in shown.arrays().items()}
