@@ -97,7 +97,9 @@ def _renderer(given: Any, scene: LoadedScene) -> OffscreenRenderer:
 
 
 def _screenshot(given: Any, scene: LoadedScene) -> None:
-    from lapgs_wgpu.viewer.offscreen import framed, write_png
+    from lapgs_wgpu.data.images import encode_png
+    from lapgs_wgpu.io.atomic import atomic_write
+    from lapgs_wgpu.viewer.offscreen import framed
 
     file = _named(given.screenshot, ".png", "--screenshot")
     time = given.time or 0.0
@@ -107,7 +109,8 @@ def _screenshot(given: Any, scene: LoadedScene) -> None:
         time = view.time if given.time is None else given.time
     else:
         camera = scene.camera().camera(*(given.size or _SIZE))
-    write_png(file, _renderer(given, scene)(camera, time))
+    with atomic_write(file) as target:
+        target.write(encode_png(_renderer(given, scene)(camera, time)))
     print(f"{file}: {camera.width}x{camera.height}, time {time:g}")
 
 

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.images import encode_png
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.viewer.frame import FrameRenderer, FrameRequest
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
@@ -49,9 +45,3 @@ def framed(camera: Camera, width: int, height: int) -> Camera:
     K[:2] *= scale
     K[0, 2] += 0.5 * (width - scale * camera.width)
     return Camera(K, camera.T_cam_world, width, height, camera.near)
-
-
-def write_png(file: Path, picture: NDArray[np.uint8]) -> None:
-    """Write (height, width, 3) uint8. Atomic. Raises InputError where it cannot be written."""
-    with atomic_write(file) as target:
-        target.write(encode_png(picture))
