@@ -7,10 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.viewer.present import HEAT, DrawnImage, Offscreen
+from lapgs_wgpu.viewer.render_modes import Mode
 
 pytestmark = [pytest.mark.kernels, pytest.mark.triangles]
 Floats = NDArray[np.float64]
@@ -67,30 +69,19 @@ def test_colors(bench: Bench) -> None:
 
 def test_coverage(bench: Bench) -> None:
     expected = np.repeat(1 - bench.planes[3][..., None], 3, axis=2)
-    near(bench.show(bench.image._replace(shows="alpha")), expected)
+    near(bench.show(bench.image._replace(mode="alpha")), expected)
 
 
-@pytest.mark.parametrize(("shows", "plane"), [("depth", 4), ("value", 0)])
-def test_values_by_a_scale_of_colors(bench: Bench, shows: str, plane: int) -> None:
-    got = bench.show(bench.image._replace(shows=shows, low=0.5, high=3.0))
+@pytest.mark.parametrize(("mode", "plane"), [("depth", 4), ("motion", 0)])
+def test_values_by_a_scale_of_colors(bench: Bench, mode: Mode, plane: int) -> None:
+    got = bench.show(bench.image._replace(mode=mode, low=0.5, high=3.0))
     near(got, scaled(bench.planes[plane], 1 - bench.planes[3], 0.5, 3.0))
 
 
 def enlarged(picture: Floats, width: int, height: int) -> Floats:
     """Bilinear, pixel centres at halves, the border repeated."""
     rows, columns = picture.shape[:2]
-    y = (np.arange(height) + 0.5) / height * rows - 0.5
-    x = (np.arange(width) + 0.5) / width * columns - 0.5
-
-    def pick(i: Floats, count: int) -> NDArray[np.int64]:
-        return np.clip(i, 0, count - 1).astype(np.int64)
-
-    fy, fx = (y - np.floor(y))[:, None, None], (x - np.floor(x))[None, :, None]
-    up, down = pick(np.floor(y), rows), pick(np.floor(y) + 1, rows)
-    left, right = pick(np.floor(x), columns), pick(np.floor(x) + 1, columns)
-    top = picture[up][:, left] * (1 - fx) + picture[up][:, right] * fx
-    bottom = picture[down][:, left] * (1 - fx) + picture[down][:, right] * fx
-    return top * (1 - fy) + bottom * fy
+    return ndimage.zoom(picture, (height / rows, width / columns, 1), order=1, mode="nearest", grid_mode=True)
 
 
 def test_enlargement_is_bilinear(bench: Bench) -> None:
@@ -99,7 +90,7 @@ def test_enlargement_is_bilinear(bench: Bench) -> None:
 
 
 def test_values_are_enlarged_as_colors(bench: Bench) -> None:
-    got = bench.show(bench.image._replace(shows="depth", high=3.0), size=(26, 14))
+    got = bench.show(bench.image._replace(mode="depth", high=3.0), size=(26, 14))
     near(got, enlarged(scaled(bench.planes[4], 1 - bench.planes[3], 0.0, 3.0), 26, 14))
 
 

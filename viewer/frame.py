@@ -88,8 +88,7 @@ class FrameRenderer:
                 break
         if mode == "depth":
             low, high = self._depth_range(drawing.image)
-        shows = {"rgb": "color", "alpha": "alpha", "depth": "depth"}.get(mode, "value")
-        image = DrawnImage(drawing.image, (camera.width, camera.height), request.background, shows, low, high)
+        image = DrawnImage(drawing.image, (camera.width, camera.height), request.background, mode, low, high)
         return Frame(request, image, time.perf_counter() - start, int(visible[0]))
 
     def depth_at(self, frame: Frame, column: int, row: int) -> float | None:

@@ -94,7 +94,7 @@ class Panels:
         state.mode = _choice("mode", state.mode, state.renderer.modes())
         _tip(MODES[state.mode])
         frame = self.viewport.frame
-        if frame is not None and frame.image.shows in ("depth", "value"):
+        if frame is not None and frame.image.mode in ("depth", "motion"):
             _legend(frame.image.low, frame.image.high)
         state.background = _choice("ground", state.background, list(BACKGROUNDS.values()), list(BACKGROUNDS))
         _tip("background")

@@ -12,6 +12,7 @@ from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.gpu.shader import compose, pack
+from lapgs_wgpu.viewer.render_modes import Mode
 
 # The scale of colors for values, from low to high.
 HEAT = (
@@ -22,7 +23,7 @@ HEAT = (
     (0.98, 0.75, 0.25),
     (0.99, 0.99, 0.80),
 )
-VALUES = ("color", "alpha", "depth", "value")  # what a pixel shows; the order is the shader's
+_NUMBERS: dict[Mode, int] = {"rgb": 0, "alpha": 1, "depth": 2, "motion": 3}  # of the modes in the shader
 OFFSCREEN_FORMAT = "rgba8unorm"
 
 
@@ -30,13 +31,13 @@ class DrawnImage(NamedTuple):
     """An image and how its values are shown.
 
     planes: as the rasterizer draws them, (4 or 5, height, width). size: (width, height).
-    shows: one of VALUES; low, high: the values at the ends of the scale, for depth and value.
+    low, high: the values at the ends of the scale, for depth and motion.
     """
 
     planes: DeviceArray
     size: tuple[int, int]
     background: tuple[float, float, float]
-    shows: str = "color"
+    mode: Mode = "rgb"
     low: float = 0.0
     high: float = 1.0
 
@@ -66,7 +67,7 @@ class Presenter:
             "background": (*image.background, 1.0),
             "size": size,
             "picture": image.size,
-            "value": VALUES.index(image.shows),
+            "value": _NUMBERS[image.mode],
             "low": image.low,
             "high": image.high,
         }
