@@ -55,7 +55,7 @@ def row(page: Path, browser: Browser) -> str:
         camera.focus_on(camera.focus)  # as setCamera does
         for time in TIMES:
             call(browser, "setTime", time)
-            expected = viewers[0].draw(camera, time).image.planes.read()[:3].transpose(1, 2, 0)
+            expected = viewers[0].draw(camera, time).planes.read()[:3].transpose(1, 2, 0)
             worst = min(worst, psnr(page_picture(browser), expected))
     times: list[list[float]] = [[], [], []]
     for time in np.linspace(0.1, 0.9, FRAMES).tolist():

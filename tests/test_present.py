@@ -11,7 +11,9 @@ from scipy import ndimage
 
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.viewer.present import HEAT, DrawnImage, Offscreen
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.viewer.frame import Frame, FrameRequest
+from lapgs_wgpu.viewer.present import HEAT, Offscreen
 from lapgs_wgpu.viewer.render_modes import Mode
 
 pytestmark = [pytest.mark.kernels, pytest.mark.triangles]
@@ -26,12 +28,15 @@ class Bench:
     """A random picture: planes (5, H, W) of red, green, blue, transmittance and depth, some beyond [0, 1]."""
 
     planes: Floats
-    image: DrawnImage
+    uploaded: DeviceArray
     offscreen: Offscreen
 
-    def show(self, image: DrawnImage, size: tuple[int, int] = (WIDTH, HEIGHT)) -> Floats:
+    def show(
+        self, mode: Mode = "rgb", size: tuple[int, int] = (WIDTH, HEIGHT), low: float = 0.0, high: float = 1.0
+    ) -> Floats:
         """(H, W, 3) as presented, in [0, 1]."""
-        return self.offscreen(size, image) / 255.0
+        request = FrameRequest(Camera(np.eye(3), np.eye(4), WIDTH, HEIGHT), 0.0, mode, BACKGROUND)
+        return self.offscreen(size, Frame(request, self.uploaded, low, high)) / 255.0
 
 
 @pytest.fixture(scope="module")
@@ -42,8 +47,7 @@ def bench(device: Device) -> Bench:
     planes[3, 0, :3] = 1.0  # nothing there
     planes[:3, 0, :3] = planes[4, 0, :3] = 0.0
     planes[4] *= 4 * (1 - planes[3])
-    image = DrawnImage(DeviceArray.upload(device, "planes", planes), (WIDTH, HEIGHT), BACKGROUND)
-    return Bench(planes.astype(np.float64), image, Offscreen(device))
+    return Bench(planes.astype(np.float64), DeviceArray.upload(device, "planes", planes), Offscreen(device))
 
 
 def near(got: Floats, expected: Floats) -> None:
@@ -64,17 +68,17 @@ def scaled(total: Floats, alpha: Floats, low: float, high: float) -> Floats:
 
 
 def test_colors(bench: Bench) -> None:
-    near(bench.show(bench.image), colors(bench.planes))
+    near(bench.show(), colors(bench.planes))
 
 
 def test_coverage(bench: Bench) -> None:
     expected = np.repeat(1 - bench.planes[3][..., None], 3, axis=2)
-    near(bench.show(bench.image._replace(mode="alpha")), expected)
+    near(bench.show("alpha"), expected)
 
 
 @pytest.mark.parametrize(("mode", "plane"), [("depth", 4), ("motion", 0)])
 def test_values_by_a_scale_of_colors(bench: Bench, mode: Mode, plane: int) -> None:
-    got = bench.show(bench.image._replace(mode=mode, low=0.5, high=3.0))
+    got = bench.show(mode, low=0.5, high=3.0)
     near(got, scaled(bench.planes[plane], 1 - bench.planes[3], 0.5, 3.0))
 
 
@@ -85,17 +89,17 @@ def enlarged(picture: Floats, width: int, height: int) -> Floats:
 
 
 def test_enlargement_is_bilinear(bench: Bench) -> None:
-    got = bench.show(bench.image, size=(40, 30))
+    got = bench.show(size=(40, 30))
     near(got, enlarged(colors(bench.planes), 40, 30))
 
 
 def test_values_are_enlarged_as_colors(bench: Bench) -> None:
-    got = bench.show(bench.image._replace(mode="depth", high=3.0), size=(26, 14))
+    got = bench.show("depth", (26, 14), high=3.0)
     near(got, enlarged(scaled(bench.planes[4], 1 - bench.planes[3], 0.0, 3.0), 26, 14))
 
 
 def test_a_target_of_another_size_follows(bench: Bench) -> None:
     for size in ((70, 3), (WIDTH, HEIGHT)):  # rows of 280 bytes are no multiple of the copy's 256
-        got = bench.show(bench.image, size=size)
+        got = bench.show(size=size)
         assert got.shape == (size[1], size[0], 3)
     near(got, colors(bench.planes))

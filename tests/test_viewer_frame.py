@@ -32,7 +32,7 @@ pytestmark = pytest.mark.kernels
 
 
 def planes(frame: Frame) -> np.ndarray:
-    return frame.image.planes.read().view(np.uint32)[:4]
+    return frame.planes.read().view(np.uint32)[:4]
 
 
 def test_the_first_frame_of_a_mode_is_of_its_own_time(device: Device, tmp_path: Path) -> None:

@@ -25,9 +25,8 @@ from numpy.typing import NDArray
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.viewer import cli
-from lapgs_wgpu.viewer.frame import FrameRenderer, FrameRequest
 from lapgs_wgpu.viewer.loaded_scene import load_scene
-from lapgs_wgpu.viewer.present import Offscreen
+from lapgs_wgpu.viewer.offscreen import OffscreenRenderer
 from lapgs_wgpu.viewer.remote import guarded, open_entry
 
 TOKEN = "a-token_of-22-letters"
@@ -179,8 +178,7 @@ def server(scene: Path) -> Iterator[Server]:
 def expected(scene: Path, device: Device, size: tuple[int, int], time: float) -> NDArray[np.int16]:
     """What the desktop draws where the viewer begins."""
     opened = load_scene(scene, lambda: device)
-    request = FrameRequest(opened.camera().camera(*size), time, "rgb", opened.background)
-    return Offscreen(device)(size, FrameRenderer(opened.playback).draw(request).image).astype(np.int16)
+    return OffscreenRenderer(opened)(opened.camera().camera(*size), time).astype(np.int16)
 
 
 def apart(a: NDArray[np.int16], b: NDArray[np.int16]) -> float:

@@ -15,7 +15,6 @@ from lapgs_wgpu.motion.playback.playback import Playback
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterizer import Rasterizer
-from lapgs_wgpu.viewer.present import DrawnImage
 from lapgs_wgpu.viewer.render_modes import MODES, Mode
 
 _TIMES = 9  # of the clip, at which the Gaussians' places are compared
@@ -33,12 +32,18 @@ class FrameRequest(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Frame:
-    """A drawn frame. seconds: until all passes were done. splats: how many touched the image."""
+    """A drawn frame.
+
+    planes: as the rasterizer draws them, (4 or 5, height, width). low, high: the values at the ends of the scale, for
+    depth and motion. seconds: until all passes were done. splats: how many touched the image.
+    """
 
     request: FrameRequest
-    image: DrawnImage
-    seconds: float
-    splats: int
+    planes: DeviceArray
+    low: float = 0.0
+    high: float = 1.0
+    seconds: float = 0.0
+    splats: int = 0
 
 
 def warm_up(device: Device) -> None:
@@ -88,13 +93,11 @@ class FrameRenderer:
                 break
         if mode == "depth":
             low, high = self._depth_range(drawing.image)
-        image = DrawnImage(drawing.image, (camera.width, camera.height), request.background, mode, low, high)
-        return Frame(request, image, time.perf_counter() - start, int(visible[0]))
+        return Frame(request, drawing.image, low, high, time.perf_counter() - start, int(visible[0]))
 
     def depth_at(self, frame: Frame, column: int, row: int) -> float | None:
         """Measure the depth along the camera's axis at a pixel, world units; None where it shows next to nothing."""
-        drawn = self.draw(frame.request._replace(mode="depth"))
-        planes = drawn.image.planes.read()
+        planes = self.draw(frame.request._replace(mode="depth")).planes.read()
         alpha = 1.0 - float(planes[3, row, column])
         return float(planes[4, row, column]) / alpha if alpha > 0.1 else None
 

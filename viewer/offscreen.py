@@ -28,7 +28,7 @@ class OffscreenRenderer:
     def __call__(self, camera: Camera, time: float) -> NDArray[np.uint8]:
         """Draw what the camera sees at a time in [0, 1]: (height, width, 3) uint8."""
         frame = self._renderer.draw(FrameRequest(camera, time, self._mode, self._background))
-        return self._offscreen((camera.width, camera.height), frame.image)
+        return self._offscreen((camera.width, camera.height), frame)
 
 
 def check_mode(scene: LoadedScene, renderer: FrameRenderer, mode: Mode) -> None:

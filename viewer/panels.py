@@ -94,8 +94,8 @@ class Panels:
         state.mode = _choice("mode", state.mode, state.renderer.modes())
         _tip(MODES[state.mode])
         frame = self.viewport.frame
-        if frame is not None and frame.image.mode in ("depth", "motion"):
-            _legend(frame.image.low, frame.image.high)
+        if frame is not None and frame.request.mode in ("depth", "motion"):
+            _legend(frame.low, frame.high)
         state.background = _choice("ground", state.background, list(BACKGROUNDS.values()), list(BACKGROUNDS))
         _tip("background")
         _, state.antialiased = imgui.checkbox("antialiased", state.antialiased)

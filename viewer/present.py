@@ -1,17 +1,17 @@
-"""The pass `present`: draws an image onto a window's texture, or one of our own, without a host copy."""
+"""The pass `present`: draws a frame onto a window's texture, or one of our own, without a host copy."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import wgpu
 from numpy.typing import NDArray
 
-from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.gpu.shader import compose, pack
+from lapgs_wgpu.viewer.frame import Frame
 from lapgs_wgpu.viewer.render_modes import Mode
 
 # The scale of colors for values, from low to high.
@@ -27,23 +27,8 @@ _NUMBERS: dict[Mode, int] = {"rgb": 0, "alpha": 1, "depth": 2, "motion": 3}  # o
 OFFSCREEN_FORMAT = "rgba8unorm"
 
 
-class DrawnImage(NamedTuple):
-    """An image and how its values are shown.
-
-    planes: as the rasterizer draws them, (4 or 5, height, width). size: (width, height).
-    low, high: the values at the ends of the scale, for depth and motion.
-    """
-
-    planes: DeviceArray
-    size: tuple[int, int]
-    background: tuple[float, float, float]
-    mode: Mode = "rgb"
-    low: float = 0.0
-    high: float = 1.0
-
-
 class Presenter:
-    """Draws images onto textures of one format of one device."""
+    """Draws frames onto textures of one format of one device."""
 
     def __init__(self, device: Device, target_format: str) -> None:
         self.device = device
@@ -60,19 +45,20 @@ class Presenter:
         )
         self._layout = self._pipeline.get_bind_group_layout(0)
 
-    def __call__(self, target: Any, size: tuple[int, int], image: DrawnImage) -> None:
-        """Submit: the image on all of `target`, a texture view of (width, height)."""
+    def __call__(self, target: Any, size: tuple[int, int], frame: Frame) -> None:
+        """Submit: the frame on all of `target`, a texture view of (width, height)."""
+        request = frame.request
         values: dict[str, object] = {f"heat{i}": (*color, 1.0) for i, color in enumerate(HEAT)}
         values |= {
-            "background": (*image.background, 1.0),
+            "background": (*request.background, 1.0),
             "size": size,
-            "picture": image.size,
-            "value": _NUMBERS[image.mode],
-            "low": image.low,
-            "high": image.high,
+            "picture": (request.camera.width, request.camera.height),
+            "value": _NUMBERS[request.mode],
+            "low": frame.low,
+            "high": frame.high,
         }
         uniform = self._pool.varying("present", lambda: pack(self._source, "Present", values))
-        entries = [{"binding": i, "resource": array.resource} for i, array in enumerate((uniform, image.planes))]
+        entries = [{"binding": i, "resource": array.resource} for i, array in enumerate((uniform, frame.planes))]
         native = self.device.wgpu_device
         encoder = native.create_command_encoder()
         attachment = {"view": target, "load_op": "clear", "store_op": "store"}
@@ -92,13 +78,13 @@ class Offscreen:
         self._texture: Any = None
         self._device = device
 
-    def __call__(self, size: tuple[int, int], image: DrawnImage) -> NDArray[np.uint8]:
-        """Draw an image on a target of (width, height); returns (height, width, 3) uint8."""
+    def __call__(self, size: tuple[int, int], frame: Frame) -> NDArray[np.uint8]:
+        """Draw a frame on a target of (width, height); returns (height, width, 3) uint8."""
         native = self._device.wgpu_device
         if self._texture is None or self._texture.size[:2] != size:
             usage = wgpu.TextureUsage.RENDER_ATTACHMENT | wgpu.TextureUsage.COPY_SRC
             self._texture = native.create_texture(size=(*size, 1), format=OFFSCREEN_FORMAT, usage=usage)
-        self._presenter(self._texture.create_view(), size, image)
+        self._presenter(self._texture.create_view(), size, frame)
         width, height = size
         pitch = (4 * width + 255) // 256 * 256
         data = self._device.queue.read_texture(

@@ -85,7 +85,7 @@ class Viewport:
         """Draw the frame on the canvas's texture."""
         assert self.frame is not None
         target = self._context.get_current_texture()
-        self._presenter(target.create_view(), target.size[:2], self.frame.image)
+        self._presenter(target.create_view(), target.size[:2], self.frame)
 
     def focus(self, x: float, y: float) -> None:
         """Move the camera's focus to the surface under a point of the canvas, logical pixels."""

@@ -90,7 +90,7 @@ class Desktop:
         camera = self.scene.camera()
         change(camera)
         frame = self.renderer.draw(FrameRequest(camera.camera(*size), time, "rgb", BACKGROUNDS[background]))
-        planes: NDArray[np.float32] = frame.image.planes.read()
+        planes: NDArray[np.float32] = frame.planes.read()
         return planes[:3].transpose(1, 2, 0)
 
 
