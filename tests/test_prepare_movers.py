@@ -151,14 +151,15 @@ def test_places_are_followed_and_lost() -> None:
     rng = np.random.default_rng(3)
     wide = np.asarray(Image.fromarray(rng.integers(0, 255, (40, 60, 3), dtype=np.uint8)).resize((180, 120)))
     images = [np.ascontiguousarray(wide[:, 3 * i : 3 * i + 160]) for i in range(5)]
-    motion = Motion([(image, True) for image in images], 5)
+    motion = Motion([(image, True) for image in images], list("abcde"))
     way = motion.tracks(0)[4] - motion.grid
     inside = (slice(3, 8), slice(4, 12))
     assert np.abs(way[inside] - [-12, 0]).max() < 0.7
     assert np.isnan(way[:, :2]).all()
     assert np.isfinite(way[:, 4:]).mean() > 0.9
     assert sorted(motion.tracks(3)) == [-3, -2, -1, 1]
-    half = Motion([(image, i % 2 == 0) for i, image in enumerate(images)], 3)  # two steps from one to the next
+    two_steps = [(image, i % 2 == 0) for i, image in enumerate(images)]  # from one to the next
+    half = Motion(two_steps, list("ace"))
     assert np.abs((half.tracks(0)[2] - half.grid)[inside] - [-12, 0]).max() < 0.7
 
 
@@ -177,9 +178,9 @@ def test_cameras_that_follow_what_moves_in_a_part_of_the_film() -> None:
     """In the first image they fit its left quarter alone, in the second all but that: both see it move."""
     moves = np.tile(np.arange(12) < 3, (9, 1))
     errors = [np.where(moves, 1.0, 8.0).astype(np.float32), np.where(moves, 20.0, 1.0).astype(np.float32)]
-    wrong = Judged(errors, [np.log(each) for each in errors], float(np.log(5)), 0.3)
+    wrong = Judged(["a", "b"], errors, [np.log(each) for each in errors], float(np.log(5)), 0.3)
     right = wrong._replace(errors=errors[1:] * 2)
-    assert (wrong.contradicted(["a", "b"]), right.contradicted(["a", "b"])) == (["a"], [])
+    assert (wrong.contradicted(), right.contradicted()) == (["a"], [])
     assert right.explained(wrong) == pytest.approx(1.5)
-    wider = [mask.mean() for mask in wrong.rough(["a", "b"], turned_over=True).values()]
+    wider = [mask.mean() for mask in wrong.rough(turned_over=True).values()]
     assert wider == [pytest.approx(1 / 3)] * 2

@@ -127,10 +127,10 @@ def _moving_camera(
     else:
         found = _checked(source, search(source, size), size, folder, pictures)
     if given is None:
-        motion = Motion(film_frames(film, pictures), len(pictures))
+        motion = Motion(film_frames(film, pictures), names)
         if known is not None:
-            seen = judge(motion, names, found.model)
-            given = cut_out(motion, names, seen) if seen.followed > UNKNOWN else {}
+            seen = judge(motion, found.model)
+            given = cut_out(motion, seen) if seen.followed > UNKNOWN else {}
         else:
             found, given = _without_movers(source, found, motion, matches, size)
     write_masks(folder / MASKS, given)
@@ -176,17 +176,17 @@ def _without_movers(
     Where much of the images disagrees, one is made of their rims, and one of what disagrees; the one that explains most
     of the images' area is right.
     """
-    seen = judge(motion, source.names, found.model)
+    seen = judge(motion, found.model)
     for rims in (True, False):
         if seen.moving <= MUCH or found.pan is not None:
             break
         of = "the images' rims" if rims else "what disagrees"
         say(f"{seen.moving:.0%} of the image area disagrees with these cameras: trying {of} alone.")
-        hidden = dict.fromkeys(source.names, RIM) if rims else seen.rough(source.names, turned_over=True)
+        hidden = dict.fromkeys(source.names, RIM) if rims else seen.rough(turned_over=True)
         source.use(without(matches, source.places, hidden, size))
         other = search(source, size, rival=True)
         if other is not None and len(other.placed) >= FEWEST * len(source.names):
-            judged = judge(motion, source.names, other.model)
+            judged = judge(motion, other.model)
             if judged.explained(seen) > 1:
                 found, seen = other, judged
     if seen.followed < FOLLOWED:
@@ -196,18 +196,18 @@ def _without_movers(
         )
     if seen.moving > LITTLE:
         say(f"{seen.moving:.1%} of the image area moves: masked, and the cameras are placed again.")
-        other = again(source, found, matches, seen.rough(source.names), size)
+        other = again(source, found, matches, seen.rough(), size)
         if other is not None and len(other.placed) >= len(found.placed) and len(other.faults) <= len(found.faults):
-            judged = judge(motion, source.names, other.model)
+            judged = judge(motion, other.model)
             if judged.explained(seen) > AGAIN:  # else the masks took too much
                 found, seen = other, judged
-    if found.pan is None and (wrong := seen.contradicted(source.names)):
+    if found.pan is None and (wrong := seen.contradicted()):
         say(
             f"more than half of what {len(wrong)} of {len(source.names)} images show, from {wrong[0]} to {wrong[-1]}, "
             "does not fit their cameras, which may follow what moves: leave out that part of the film, or mask what "
             "moves (--masks)."
         )
-    return found, cut_out(motion, source.names, seen) if seen.followed > UNKNOWN else {}
+    return found, cut_out(motion, seen) if seen.followed > UNKNOWN else {}
 
 
 def _checked(

@@ -26,14 +26,15 @@ MEET, MEET_SHARE = 1.5, 0.05  # pixels between a place and its way forth and bac
 
 
 class Motion:
-    """The flow of a film. images: (h, w, 3) RGB, SIDE pixels at most, one of each picture. forth, back: (h, w, 2)
-    float16 pixels from each to the next one, and from the next one to each."""
+    """The flow of a film. names: of its pictures. images: (h, w, 3) RGB, SIDE pixels at most, one of each picture.
+    forth, back: (h, w, 2) float16 pixels from each to the next one, and from the next one to each."""
 
-    def __init__(self, frames: Iterable[tuple[Pixels, bool]], count: int) -> None:
-        """frames: small images of equal size in order, and whether each is one of the `count` pictures."""
+    def __init__(self, frames: Iterable[tuple[Pixels, bool]], names: Sequence[str]) -> None:
+        """frames: small images of equal size in order, and whether each is one of the pictures."""
         cv2 = self._cv2 = import_cv2()
         dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         dis.setFinestScale(1)
+        self.names = names
         self.images: list[Pixels] = []
         self.forth: list[NDArray[np.float16]] = []
         self.back: list[NDArray[np.float16]] = []
@@ -41,7 +42,7 @@ class Motion:
         before: Any = None
         forth: Plane | None = None
         back: Plane | None = None
-        with Progress(count, "images followed") as progress:
+        with Progress(len(names), "images followed") as progress:
             for image, chosen in frames:
                 gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
                 if before is not None:

@@ -36,10 +36,11 @@ AROUND, INSIDE = 10, 5  # pixels around what moves, where colors decide; within 
 
 
 class Judged(NamedTuple):
-    """What a reconstruction does not explain. errors: (rows, columns) of the grid of each image, in times the noise,
-    NaN where nothing can be said. votes: the logarithms that neighbouring images agree on; above `limit` it moves.
-    noise: pixels, between neighbouring images."""
+    """What a reconstruction does not explain. names: of the images. errors: (rows, columns) of the grid of each, in
+    times the noise, NaN where nothing can be said. votes: the logarithms that neighbouring images agree on; above
+    `limit` it moves. noise: pixels, between neighbouring images."""
 
+    names: Sequence[str]
     errors: list[Plane]
     votes: list[Plane]
     limit: float
@@ -63,12 +64,12 @@ class Judged(NamedTuple):
         mine, others = (float(np.mean([e * each.noise < limit for e in each.errors])) for each in (self, other))
         return mine / max(others, 1e-9)
 
-    def contradicted(self, names: Sequence[str]) -> list[str]:
+    def contradicted(self) -> list[str]:
         """The images of which more than half of the known area is off by MOVES times the noise or more."""
-        pairs = zip(names, self.errors, strict=True)
+        pairs = zip(self.names, self.errors, strict=True)
         return [name for name, errors in pairs if (errors > MOVES).sum() > 0.5 * max(np.isfinite(errors).sum(), 1)]
 
-    def rough(self, names: Sequence[str], *, turned_over: bool = False) -> dict[str, Mask]:
+    def rough(self, *, turned_over: bool = False) -> dict[str, Mask]:
         """Masks on the grid, a little wider than what moves. turned_over: than what agrees, in images that disagree at
         least half as much as the worst one: their cameras may follow what moves."""
         masks = [vote > self.limit for vote in self.votes]
@@ -77,28 +78,29 @@ class Judged(NamedTuple):
             pairs = zip(masks, self.errors, strict=True)
             masks = [errors < SHARP if mask.mean() >= worst / 2 else mask for mask, errors in pairs]
         wider = [import_cv2().dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0 for mask in masks]
-        return dict(zip(names, wider, strict=True))
+        return dict(zip(self.names, wider, strict=True))
 
 
-def judge(motion: Motion, names: Sequence[str], model: Any) -> Judged:
-    """names: of the images of the flow. model: a pycolmap.Reconstruction of some of them."""
-    errors, noise = unexplained(motion, names, model)
+def judge(motion: Motion, model: Any) -> Judged:
+    """model: a pycolmap.Reconstruction of some of the flow's images."""
+    errors, noise = unexplained(motion, model)
     votes = _votes(motion, errors)
     known = np.concatenate([vote[np.isfinite(vote)] for vote in votes])
-    return Judged(errors, votes, max(float(np.log(MOVES)), np.log(HALO) + _valley(known[known > np.log(1.5)])), noise)
+    limit = max(float(np.log(MOVES)), np.log(HALO) + _valley(known[known > np.log(1.5)]))
+    return Judged(motion.names, errors, votes, limit, noise)
 
 
-def cut_out(motion: Motion, names: Sequence[str], judged: Judged) -> dict[str, Mask]:
+def cut_out(motion: Motion, judged: Judged) -> dict[str, Mask]:
     """Masks of what moves (h, w), of the size of the flow's images."""
-    planes = zip(names, motion.images, judged.votes, strict=True)
+    planes = zip(motion.names, motion.images, judged.votes, strict=True)
     return {name: _cut(image, vote, judged.limit) for name, image, vote in planes}
 
 
-def unexplained(motion: Motion, names: Sequence[str], model: Any) -> tuple[list[Plane], float]:
+def unexplained(motion: Motion, model: Any) -> tuple[list[Plane], float]:
     """For each image the error (rows, columns) of its grid, in times the noise, NaN where nothing can be said; and the
     noise between neighbouring images, pixels."""
     placed = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
-    images = [placed.get(name) for name in names]
+    images = [placed.get(name) for name in motion.names]
     poses: list[Any] = [None if image is None else image.cam_from_world().matrix() for image in images]
     points = np.stack([point.xyz for point in model.points3D.values()])
     depths = [points @ pose[2, :3] + pose[2, 3] for pose in poses[:: max(1, len(poses) // 20)] if pose is not None]
@@ -125,13 +127,13 @@ def unexplained(motion: Motion, names: Sequence[str], model: Any) -> tuple[list[
 
     least = NOISE + NOISE_GROWS * np.arange(REACH + 1)
     samples: list[list[Floats]] = [[np.zeros(0)] for _ in least]
-    for i in range(0, len(names), max(1, len(names) // 12)):
+    for i in range(0, len(images), max(1, len(images) // 12)):
         _, offsets, each = errors(i, least)
         for k, error in zip(offsets, each, strict=True):
             samples[abs(k)].append(error[np.isfinite(error)])
     low = [float(np.percentile(np.concatenate(s), QUARTER)) if sum(map(len, s)) else 0.0 for s in samples]
     noise = np.maximum(least, MEDIAN * np.array(low))
-    planes = [errors(i, noise)[0].reshape(motion.grid.shape[:2]).astype(np.float32) for i in range(len(names))]
+    planes = [errors(i, noise)[0].reshape(motion.grid.shape[:2]).astype(np.float32) for i in range(len(images))]
     return planes, float(noise[1])
 
 
