@@ -33,7 +33,7 @@ from lapgs_wgpu.progress import say
 LENS = "RADIAL"
 FEWEST, WHOLE = 0.3, 0.9  # of the images need a pose; of fewer than this only a part of the film fits
 LITTLE, MUCH = 0.002, 0.15  # share of the images: less motion needs no masks; more may have led the cameras astray
-FOLLOWED, UNKNOWN = 0.8, 0.2  # share of the image area where flow must tell whether it moves; less makes no masks
+FOLLOWED = 0.8  # share of the image area where flow must tell whether it moves; of less the user is told
 AGAIN = 0.98  # of the area that was explained before, at least, by cameras without what moves
 STANDING = 4e-3  # of the longer side: the image of a camera that stands still moves less over the film
 FEATURES, SHARED = 200, 60  # of an image; in common with the next one: fewer say why cameras are not found
@@ -129,8 +129,7 @@ def _moving_camera(
     if given is None:
         motion = Motion(film_frames(film, pictures), names)
         if known is not None:
-            seen = judge(motion, found.model)
-            given = cut_out(motion, seen) if seen.followed > UNKNOWN else {}
+            given = cut_out(motion, judge(motion, found.model))
         else:
             found, given = _without_movers(source, found, motion, matches, size)
     write_masks(folder / MASKS, given)
@@ -207,7 +206,7 @@ def _without_movers(
             "does not fit their cameras, which may follow what moves: leave out that part of the film, or mask what "
             "moves (--masks)."
         )
-    return found, cut_out(motion, seen) if seen.followed > UNKNOWN else {}
+    return found, cut_out(motion, seen)
 
 
 def _checked(

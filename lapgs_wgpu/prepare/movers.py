@@ -25,6 +25,7 @@ QUARTER, MEDIAN = 25, 1.55  # percentile of the errors that tells the noise; a m
 MOST = 30.0  # times the noise: larger errors are equal
 PASSES = 4  # of the robust fit of a depth
 NEAR = 0.5  # times the depth of the nearest points of the scene: nothing is nearer
+UNKNOWN = 0.2  # share of the image area in which flow must tell whether it moves; less makes no masks
 FEWEST = 2  # images around one, in which a place must be followed
 VOTES = 4  # images to either side that vote
 MOVES = 5.0  # times the noise, at least: it moves
@@ -91,7 +92,9 @@ def judge(motion: Motion, model: Any) -> Judged:
 
 
 def cut_out(motion: Motion, judged: Judged) -> dict[str, Mask]:
-    """Masks of what moves (h, w), of the size of the flow's images."""
+    """Masks of what moves (h, w), of the size of the flow's images; none where flow tells too little."""
+    if judged.followed <= UNKNOWN:
+        return {}
     planes = zip(motion.names, motion.images, judged.votes, strict=True)
     return {name: _cut(image, vote, judged.limit) for name, image, vote in planes}
 
