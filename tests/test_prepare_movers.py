@@ -95,13 +95,9 @@ def seen_by(cameras: list, points: np.ndarray) -> np.ndarray:
     return np.stack(found)
 
 
-def relative(cameras: list) -> list:
-    first = cameras[0].T_cam_world
-    pairs = []
-    for camera in cameras[1:]:
-        R = camera.T_cam_world[:3, :3] @ first[:3, :3].T
-        pairs.append((R, camera.T_cam_world[:3, 3] - R @ first[:3, 3]))
-    return pairs
+def relative(cameras: list) -> np.ndarray:
+    """(k, 4, 4) poses of all but the first camera, seen from that."""
+    return np.stack([camera.T_cam_world for camera in cameras[1:]]) @ np.linalg.inv(cameras[0].T_cam_world)
 
 
 def test_still_points_are_explained_and_others_are_not() -> None:
@@ -125,23 +121,22 @@ def test_what_is_nearer_than_the_scene_or_behind_infinity_is_not_explained() -> 
     cameras = walk(12, 320, 240)[:5]
     points = np.random.default_rng(1).uniform(-0.8, 0.8, (20, 3))
     seen = seen_by(cameras, points)
-    pairs, sigma = relative(cameras), np.full(4, 2e-4)
-    assert depth_errors(seen[0], seen[1:], pairs, sigma, 1.0)[0].max() < 0.1
-    assert depth_errors(seen[0], seen[1:], pairs, sigma, 0.05)[0].min() > 5, "all is nearer than allowed"
-    away = [(R, -t) for R, t in pairs]
-    assert depth_errors(seen[0], seen[1:], away, sigma, 1.0)[0].min() > 5, "all is behind infinity"
+    poses, sigma = relative(cameras), np.full(4, 2e-4)
+    assert depth_errors(seen[0], seen[1:], poses, sigma, 1.0)[0].max() < 0.1
+    assert depth_errors(seen[0], seen[1:], poses, sigma, 0.05)[0].min() > 5, "all is nearer than allowed"
+    poses[:, :3, 3] *= -1
+    assert depth_errors(seen[0], seen[1:], poses, sigma, 1.0)[0].min() > 5, "all is behind infinity"
 
 
 def test_a_camera_that_turns_needs_no_depth() -> None:
     rng = np.random.default_rng(2)
     ray = rng.uniform(-0.3, 0.3, (30, 2))
-    pairs, seen = [], []
-    for turn in (0.02, 0.05, 0.09):
-        R = np.array([[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]])
-        at = np.column_stack([ray, np.ones(30)]) @ R.T
-        pairs.append((R, np.zeros(3)))
+    poses, seen = np.tile(np.eye(4), (3, 1, 1)), []
+    for pose, turn in zip(poses, (0.02, 0.05, 0.09), strict=True):
+        pose[:3, :3] = [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]
+        at = np.column_stack([ray, np.ones(30)]) @ pose[:3, :3].T
         seen.append(at[:, :2] / at[:, 2:] + np.where(np.arange(30) < 20, 0, turn / 4)[:, None])
-    total, _ = depth_errors(ray, np.stack(seen), pairs, np.full(3, 5e-4), 1.0)
+    total, _ = depth_errors(ray, np.stack(seen), poses, np.full(3, 5e-4), 1.0)
     assert total[:20].max() < 1e-3
     assert total[20:].min() > 5
 

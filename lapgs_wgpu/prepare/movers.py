@@ -104,7 +104,7 @@ def unexplained(motion: Motion, model: Any) -> tuple[list[Plane], float]:
     noise between neighbouring images, pixels."""
     placed = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
     images = [placed.get(name) for name in motion.names]
-    poses: list[Any] = [None if image is None else image.cam_from_world().matrix() for image in images]
+    poses: list[Any] = [None if i is None else np.vstack([i.cam_from_world().matrix(), [0, 0, 0, 1]]) for i in images]
     points = np.stack([point.xyz for point in model.points3D.values()])
     depths = [points @ pose[2, :3] + pose[2, 3] for pose in poses[:: max(1, len(poses) // 20)] if pose is not None]
     nearest = float(np.median([np.percentile(depth[depth > 0], 5) for depth in depths if (depth > 0).any()] or [1.0]))
@@ -121,8 +121,7 @@ def unexplained(motion: Motion, model: Any) -> tuple[list[Plane], float]:
         tracks = {k: at for k, at in motion.tracks(i).items() if poses[i + k] is not None}
         if poses[i] is None or len(tracks) < FEWEST:
             return np.full(motion.grid.shape[0] * motion.grid.shape[1], np.nan), [], np.zeros((0, 0))
-        relative = [poses[i + k][:, :3] @ poses[i][:, :3].T for k in tracks]
-        relative = [(R, poses[i + k][:, 3] - R @ poses[i][:, 3]) for k, R in zip(tracks, relative, strict=True)]
+        relative = np.stack([poses[i + k] for k in tracks]) @ np.linalg.inv(poses[i])
         seen = np.stack([directions(at) for at in tracks.values()])
         sigma = np.array([noise[abs(k)] for k in tracks]) / focal
         total, each = depth_errors(directions(motion.grid), seen, relative, sigma, 1 / (NEAR * nearest))
@@ -140,18 +139,16 @@ def unexplained(motion: Motion, model: Any) -> tuple[list[Plane], float]:
     return planes, float(noise[1])
 
 
-def depth_errors(
-    ray: Floats, seen: Floats, relative: Sequence[tuple[Floats, Floats]], sigma: Floats, most: float
-) -> tuple[Floats, Floats]:
+def depth_errors(ray: Floats, seen: Floats, relative: Floats, sigma: Floats, most: float) -> tuple[Floats, Floats]:
     """How far still points miss their ways: (n,) of all images together and (k, n) of each, in times the noise.
 
-    ray: (n, 2) directions x / z, y / z in one image. seen: (k, n, 2) in others, NaN where unknown. relative: rotation
-    and translation from the one to each other. sigma: (k,) noise of `seen`. The inverse depth, from 0 to `most`, is
+    ray: (n, 2) directions x / z, y / z in one image. seen: (k, n, 2) in others, NaN where unknown. relative:
+    (k, 4, 4) from the one to each other. sigma: (k,) noise of `seen`. The inverse depth, from 0 to `most`, is
     fitted robustly. NaN where less than FEWEST images know a place.
     """
     deep, seen = np.concatenate([ray, np.ones((len(ray), 1))], axis=1), seen.astype(np.float32)
-    far = np.stack([deep @ R.T for R, _ in relative]).astype(np.float32)  # of a point at infinity
-    move, sigma = np.stack([t for _, t in relative])[:, None].astype(np.float32), sigma.astype(np.float32)
+    far = (deep @ relative[:, :3, :3].transpose(0, 2, 1)).astype(np.float32)  # of a point at infinity
+    move, sigma = relative[:, None, :3, 3].astype(np.float32), sigma.astype(np.float32)
     known: Mask = np.asarray(np.isfinite(seen).all(axis=2))
     seen = np.where(known[..., None], seen, 0.0)
     a = move[..., :2] - seen * move[..., 2:]  # b + inverse depth * a = 0, up to depth
