@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.captures import opengl, write_points
 from helpers.films import Board, drawn, walk
 from PIL import Image
 
@@ -22,7 +23,6 @@ from lapgs_wgpu.train import plan
 from lapgs_wgpu.train.presets import load_config
 
 COUNT, SIZE = 12, (160, 120)
-GL = np.diag([1.0, -1.0, -1.0, 1.0])
 ROOM = np.array([[x, y, z] for x in np.linspace(-1.8, 1.8, 13) for y in (1.0, 2.0) for z in np.linspace(-0.9, 1.8, 9)])
 
 
@@ -40,16 +40,12 @@ def write_capture(
         path = folder / "images" / name
         path.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(image).save(path)
-        pose = np.linalg.inv(camera.T_cam_world) @ GL
         time = i / len(cameras) if times is None else times[i]
-        frames.append({"file_path": f"images/{name}", "transform_matrix": pose.tolist(), "time": time})
+        frames.append({"file_path": f"images/{name}", "transform_matrix": opengl(camera).tolist(), "time": time})
     K = cameras[0].K
     lens = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": SIZE[0], "h": SIZE[1]}
     (folder / "transforms.json").write_text(json.dumps(lens | {"frames": frames, "ply_file_path": "points.ply"}))
-    rows = "\n".join(f"{x} {y} {z} 90 90 90" for x, y, z in ROOM)
-    head = ["ply", "format ascii 1.0", f"element vertex {len(ROOM)}", *(f"property float {a}" for a in "xyz")]
-    head += [f"property uchar {color}" for color in ("red", "green", "blue")]
-    (folder / "points.ply").write_text("\n".join([*head, "end_header", rows]) + "\n")
+    write_points(folder / "points.ply", ROOM, np.full(ROOM.shape, 90), text=True)
     return folder
 
 

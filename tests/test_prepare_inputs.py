@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.captures import opengl
 from helpers.films import Board, drawn, noise_pictures, pose_errors, walk, write_film
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -113,7 +114,7 @@ def write_calibration(folder: Path, form: str, cameras: list[Camera], distortion
         names = ("k1", "k2", "p1", "p2")
         frames = [
             {"file_path": f"images/cam{i}.png", "fl_x": c.K[0, 0], "fl_y": c.K[1, 1], "cx": c.K[0, 2], "cy": c.K[1, 2],
-             "transform_matrix": (np.linalg.inv(c.T_cam_world) @ np.diag([1, -1, -1, 1])).tolist()}
+             "transform_matrix": opengl(c).tolist()}
             for i, c in numbered
         ]  # fmt: skip
         text = json.dumps({"w": size[0], "h": size[1], **dict(zip(names, distortion, strict=True)), "frames": frames})
