@@ -93,7 +93,8 @@ def _reason(
     true = {name: array.read()[rows] for name, array in exact.arrays().items()}
     gains = {}
     for name, values in true.items():
-        gains[name] = psnr_of(dataclasses.replace(shown, **{name: upload(device, values)}))
+        arrays = shown.arrays() | {name: upload(device, values)}
+        gains[name] = psnr_of(Gaussians(**arrays, antialiased=shown.antialiased))
     if psnr_of(dataclasses.replace(shown, antialiased=exact.antialiased)) > max(gains.values()):
         return "the scene is drawn antialiased, which the file does not say"
     name = max(gains, key=gains.__getitem__)

@@ -34,10 +34,11 @@ def path_faults(places: Floats, axes: Floats, points: Floats, names: Sequence[st
     still = length < (0.02 * usual if np.median(length) == usual else 0.0)
     long = max(3, len(still) // 10)
     stalls = [i for i in range(len(still) - long + 1) if still[i : i + long].all()][:1]
-    far, turned, back = (np.flatnonzero(where).tolist() for where in (length > STEP * usual, turns > TURN * turn, back))
-    faults = [(f"a step of {length[i] / usual:.0f} times the usual one", i + 1) for i in far]
-    faults += [(f"a turn of {turns[i]:.0f} degrees", i + 1) for i in turned]
-    faults += [("the path doubles back", i + 1) for i in back] + [("the path stalls", i) for i in stalls]
+    leaps, jerks = np.flatnonzero(length > STEP * usual).tolist(), np.flatnonzero(turns > TURN * turn).tolist()
+    faults = [(f"a step of {length[i] / usual:.0f} times the usual one", i + 1) for i in leaps]
+    faults += [(f"a turn of {turns[i]:.0f} degrees", i + 1) for i in jerks]
+    faults += [("the path doubles back", i + 1) for i in np.flatnonzero(back).tolist()]
+    faults += [("the path stalls", i) for i in stalls]
     stems = [Path(name).stem for name in names]
     if all(len(stem) == 8 and stem.isdecimal() for stem in stems):
         seconds = (int(stems[-1]) - int(stems[0])) / 1000
