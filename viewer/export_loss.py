@@ -19,7 +19,6 @@ from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.linear_light import sh_basis
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
-from lapgs_wgpu.viewer.video import orbit_views
 
 Floats = NDArray[np.floating]
 Rows = NDArray[np.integer]
@@ -59,9 +58,8 @@ def measure(scene: LoadedScene, written: Written, time: float | None = None, fra
 
     if time is None and not scene.playback.moves:
         time = 0.0
-    pictures, captured = [], scene.initial_view.camera
-    size = captured.width, captured.height
-    for camera, t in orbit_views(scene.camera(), size, _PICTURES, time, scene.initial_view.arc):
+    pictures = []
+    for camera, t in scene.around(_PICTURES, time):
         t = t if frames is None else round(t * (frames - 1)) / max(1, frames - 1)
         wanted = drawn(scene.playback.at(t), camera)
         pictures.append((_psnr(wanted, drawn(written(camera, t)[0], camera)), camera, t, wanted))

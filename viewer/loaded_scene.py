@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -25,6 +25,7 @@ from lapgs_wgpu.viewer.clock import Clock
 from lapgs_wgpu.viewer.options import USD
 from lapgs_wgpu.viewer.render_modes import AHEAD, BACKGROUNDS
 from lapgs_wgpu.viewer.usd_file import read_usd
+from lapgs_wgpu.viewer.video import TimedCamera, orbit_views
 
 if TYPE_CHECKING:
     from lapgs_wgpu.data import View
@@ -46,6 +47,11 @@ class LoadedScene(NamedTuple):
     def camera(self) -> ViewCamera:
         """Make a camera where the viewer begins."""
         return ViewCamera(self.initial_view.camera, self.initial_view.focus, self.initial_view.up)
+
+    def around(self, count: int, time: float | None) -> Iterator[TimedCamera]:
+        """Cameras around the focus, in the size of the captured images; time as of `orbit_views`."""
+        captured = self.initial_view.camera
+        return orbit_views(self.camera(), (captured.width, captured.height), count, time, self.initial_view.arc)
 
     def clock(self) -> Clock:
         """Make the clock of the clip, at its start."""

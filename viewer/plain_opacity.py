@@ -9,7 +9,6 @@ from lapgs_wgpu.gpu.array import read_all
 from lapgs_wgpu.splat.camera import Camera, rotation_matrix
 from lapgs_wgpu.splat.constants import CONSTANTS
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
-from lapgs_wgpu.viewer.video import orbit_views
 
 Floats = NDArray[np.floating]
 _VIEWS = 8  # around the focus, each at another time of the clip
@@ -24,10 +23,8 @@ def plain_factors(scene: LoadedScene) -> Floats:
     """
     if not scene.playback.at(0.0).antialiased:
         return np.ones(scene.playback.count)
-    captured, factors = scene.initial_view.camera, []
-    for camera, t in orbit_views(
-        scene.camera(), (captured.width, captured.height), _VIEWS, None, scene.initial_view.arc
-    ):
+    factors = []
+    for camera, t in scene.around(_VIEWS, None):
         now = scene.playback.at(t)
         means, quats, scales = read_all([now.means, now.quats, now.scales])
         factors.append(_faded(means, quats, scales, camera))
