@@ -77,7 +77,7 @@ def image_names(files: Sequence[str], places: Mapping[str, NDArray[np.float64]])
     readings = timed(outer), cameras if inner == stem else timed(inner)
     decided = _folders_are_times([each[outer] for each in parts], [each[inner] for each in parts])
     if decided is None:
-        still = [stand_still(_places_of_each(names, places)) for names in readings]
+        still = [stand_still(names, places) for names in readings]
         fewer = len({name.camera for name in readings[0]}) < len({name.camera for name in readings[1]})
         decided = still[0] if still[0] != still[1] else fewer
     return readings[0] if decided else readings[1]
@@ -95,7 +95,7 @@ def _named_by_both(files: Sequence[str], places: Mapping[str, NDArray[np.float64
         word = rows[0][camera - 1] if camera and rows[0][camera - 1].lower() in CAMERA_WORDS else ""
         names = [ImageName(file, word + row[camera], row[time]) for file, row in zip(files, rows, strict=True)]
         grid = len({name.camera for name in names}) * len({name.part for name in names})
-        if grid <= FILLED * len(files) and stand_still(_places_of_each(names, places)):
+        if grid <= FILLED * len(files) and stand_still(names, places):
             return names
     return None
 
@@ -120,22 +120,19 @@ def _word(name: str) -> str:
     return re.sub(r"[\W\d_]", "", re.sub(r"\d+\D*$", "", name)).lower()
 
 
-def _places_of_each(
-    names: Iterable[ImageName], places: Mapping[str, NDArray[np.float64]]
-) -> list[list[NDArray[np.float64]]]:
-    groups: dict[str, list[NDArray[np.float64]]] = {}
+def stand_still(names: Iterable[ImageName], places: Mapping[str, NDArray[np.float64]]) -> bool:
+    """Whether there are several cameras, each at one place, as exactly as structure from motion finds it.
+
+    places: (3,) of the cameras of some of the files.
+    """
+    cameras: dict[str, list[NDArray[np.float64]]] = {}
     for name in names:
         if name.file in places:
-            groups.setdefault(name.camera, []).append(places[name.file])
-    return list(groups.values())
-
-
-def stand_still(cameras: Sequence[Sequence[NDArray[np.float64]]]) -> bool:
-    """Whether the places (3,) of each of several cameras are one, as exactly as structure from motion finds it."""
+            cameras.setdefault(name.camera, []).append(places[name.file])
     if len(cameras) < 2:
         return False
-    apart = float(np.ptp(np.concatenate(cameras), axis=0).max())
-    return all(float(np.ptp(own, axis=0).max()) <= STILL * apart for own in cameras)
+    apart = float(np.ptp(np.concatenate(list(cameras.values())), axis=0).max())
+    return all(float(np.ptp(own, axis=0).max()) <= STILL * apart for own in cameras.values())
 
 
 # Times

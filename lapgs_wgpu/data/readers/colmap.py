@@ -102,17 +102,15 @@ def _frames(
     """Return the images with a pose, their own or that of their still camera. Appends a warning about those without."""
     places = {file: place_of(image.T_cam_world) for file, image in registered.items()}
     names = image_names(files, places)
-    by_camera: dict[str, list[str]] = {}
+    first: dict[str, ColmapImage] = {}  # of each camera
     for name in names:
         if name.file in registered:
-            by_camera.setdefault(name.camera, []).append(name.file)
-    still = stand_still([[places[file] for file in own] for own in by_camera.values()])
+            first.setdefault(name.camera, registered[name.file])
+    still = first if stand_still(names, places) else {}
     frames: list[Frame] = []
     left_out: list[str] = []
     for name in names:
-        posed = registered.get(name.file)
-        if posed is None and still and name.camera in by_camera:
-            posed = registered[by_camera[name.camera][0]]
+        posed = registered.get(name.file) or still.get(name.camera)
         if posed is None:
             left_out.append(name.file)
             continue
