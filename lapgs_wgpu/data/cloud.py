@@ -115,6 +115,12 @@ def in_view(points: NDArray[np.floating], camera: Camera) -> tuple[NDArray[np.fl
     return np.where(ahead, depths, np.nan), ahead & within[:, 0] & within[:, 1]
 
 
+def points_at(camera: Camera, pixels: Array, depths: Array) -> Array:
+    """The points (N, 3), world units, that a camera sees at pixels (N, 2) and depths (N,)."""
+    rays = np.linalg.solve(camera.K, np.column_stack([pixels, np.ones(len(pixels))]).T)
+    return ((rays * depths).T - camera.T_cam_world[:3, 3]) @ camera.T_cam_world[:3, :3]
+
+
 def points_in_view(cameras: Sequence[Camera], near: float, far: float, count: int, seed: int) -> Array:
     """Draw (count, 3) random points where the cameras' views overlap, at depths between near and far, world units.
 
@@ -133,9 +139,7 @@ def points_in_view(cameras: Sequence[Camera], near: float, far: float, count: in
         points = np.empty((n, 3))
         for index, camera in enumerate(cameras):
             mine = which == index
-            pixels = np.column_stack([across[mine] * [camera.width, camera.height], np.ones(mine.sum())])
-            local = np.linalg.solve(camera.K, pixels.T).T * depth[mine, None]
-            points[mine] = (local - camera.T_cam_world[:3, 3]) @ camera.T_cam_world[:3, :3]
+            points[mine] = points_at(camera, across[mine] * [camera.width, camera.height], depth[mine])
         seen = views_of(points, cameras, near * (1 - 1e-9), far * (1 + 1e-9))
         least = least or seen.max() / 2
         kept = np.concatenate([kept, points[seen >= least]])

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.cloud import Cloud, in_view, points_in_view, views_of
+from lapgs_wgpu.data.cloud import Cloud, in_view, points_at, points_in_view, views_of
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.focus import are_parallel, focus_of
 from lapgs_wgpu.data.frames import Capture, Frame
@@ -166,30 +166,23 @@ def mover_cube(cloud: Cloud, seen: Sequence[tuple[Camera, Callable[[], Mask]]]) 
     from scipy import ndimage  # slow to import
 
     points = cloud.points.astype(np.float64)
-    boxes = [found for camera, mask in evenly(seen, IMAGES) if (found := _box(camera, mask(), points)) is not None]
+    boxes = [(camera, box) for camera, mask in evenly(seen, IMAGES) if (box := _box(camera, mask(), points))]
     if not boxes:
         return None
-    depths = ndimage.median_filter(np.array([box.depth for box in boxes]), MEDIAN, mode="nearest")
-    corners = []
-    for box, depth in zip(boxes, depths, strict=True):
-        camera = box.camera
-        rays = np.linalg.solve(camera.K, np.array([[x, y, 1.0] for x in box.sides for y in box.ends]).T)
-        corners.append((depth * rays - camera.T_cam_world[:3, 3:]).T @ camera.T_cam_world[:3, :3])
-    low, high = np.min(np.concatenate(corners), axis=0), np.max(np.concatenate(corners), axis=0)
+    depths = ndimage.median_filter(np.array([depth for _, (_, depth) in boxes]), MEDIAN, mode="nearest")
+    corners = np.concatenate(
+        [
+            points_at(camera, pixels, np.full(4, depth))
+            for (camera, (pixels, _)), depth in zip(boxes, depths, strict=True)
+        ]
+    )
+    low, high = corners.min(axis=0), corners.max(axis=0)
     return Cube((low + high) / 2, float(max(ROOM * (high - low).max() / 2, 1e-6)))
 
 
-class _Box(NamedTuple):
-    """What moves in the image of a camera. sides, ends: left and right, top and bottom, pixels."""
-
-    camera: Camera
-    sides: tuple[float, float]
-    ends: tuple[float, float]
-    depth: float
-
-
-def _box(camera: Camera, mask: Mask, points: NDArray[np.float64]) -> _Box | None:
-    """The largest thing that moves in an image; None where nothing does, or no point tells its depth."""
+def _box(camera: Camera, mask: Mask, points: NDArray[np.float64]) -> tuple[Array, float] | None:
+    """The corners (4, 2), pixels, of the largest thing that moves in an image, and its depth; None where nothing does,
+    or no point tells the depth."""
     from scipy import ndimage  # slow to import
 
     labels, count = ndimage.label(mask)
@@ -211,4 +204,4 @@ def _box(camera: Camera, mask: Mask, points: NDArray[np.float64]) -> _Box | None
     foot &= depth < np.median(depth[around])  # what a wet road mirrors lies beyond
     if foot.any():
         found = min(found, float(np.median(depth[foot])))
-    return _Box(camera, (left, right), (top, bottom), found)
+    return np.array([[left, top], [left, bottom], [right, top], [right, bottom]]), found

@@ -20,6 +20,7 @@ from PIL import Image
 from scipy import ndimage, sparse
 from scipy.sparse.linalg import spsolve
 
+from lapgs_wgpu.data.cloud import points_at
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.views import Dataset, small_views
 from lapgs_wgpu.progress import counted, say
@@ -127,7 +128,7 @@ def _surfaces(stills: list[_Still], bounds: tuple[float, float]) -> list[tuple[P
     filled = [_filled(still, depths) for still, depths in zip(stills, known, strict=True)]
     surfaces = []
     for still, depths, believed in zip(stills, filled, known, strict=True):
-        places = _places(still.camera, 1 / np.where(np.isfinite(depths), depths, 1.0).ravel())
+        places = _places(still.camera, depths)
         agreeing, _ = _votes(places, still, stills, filled, tolerance)
         _, beyond = _votes(places, still, stills, known, tolerance)
         kept = np.isfinite(believed.ravel()) | (np.isfinite(depths.ravel()) & (agreeing >= CONFIRMED) & (beyond == 0))
@@ -209,11 +210,10 @@ def _box(image: Array) -> Array:
     return ndimage.uniform_filter(image, WINDOW, mode="nearest")
 
 
-def _places(camera: Camera, depths: Array) -> Array:
-    """(H W, 3) the points at these depths (H W,) of the middles of the pixels, world units."""
+def _places(camera: Camera, inverse: Array) -> Array:
+    """(H W, 3) the points at the middles of the pixels, world units. inverse: depths (H, W), 1 where they are NaN."""
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-    rays = np.linalg.solve(camera.K, np.stack([x.ravel(), y.ravel(), np.ones(x.size)]))
-    return (rays * depths - camera.T_cam_world[:3, 3:]).T @ camera.T_cam_world[:3, :3]
+    return points_at(camera, np.column_stack([x.ravel(), y.ravel()]), 1 / np.nan_to_num(inverse, nan=1.0).ravel())
 
 
 def _votes(places: Array, still: _Still, stills: list[_Still], maps: list[Array], most: float) -> tuple[Array, Array]:
@@ -239,7 +239,7 @@ def _confirmed(stills: list[_Still], maps: list[Array], most: float) -> list[Mas
     """(H, W) of each camera: inverse depths that others confirm, that fewer see through, and that lie in a patch."""
     masks = []
     for still, depths in zip(stills, maps, strict=True):
-        places = _places(still.camera, 1 / np.where(np.isfinite(depths), depths, 1.0).ravel())
+        places = _places(still.camera, depths)
         agreeing, beyond = (votes.reshape(depths.shape) for votes in _votes(places, still, stills, maps, most))
         kept = np.isfinite(depths) & (agreeing >= CONFIRMED) & (agreeing > beyond)
         padded = np.pad(np.where(kept, depths, np.nan), WINDOW // 2, constant_values=np.nan)
