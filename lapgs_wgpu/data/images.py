@@ -246,6 +246,11 @@ def shrunk_size(stored: Size, image_size: int | None) -> Size:
     return width, height
 
 
+def scales_to(size: Size, other: Size) -> bool:
+    """Whether images of two sizes may be one that was resized, its sides rounded up or down."""
+    return abs(size[0] * other[1] / other[0] - size[1]) <= 1.5
+
+
 def size_text(size: Size) -> str:
     """A size as errors show it."""
     return f"{size[0]}x{size[1]}"

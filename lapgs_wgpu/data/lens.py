@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.images import Pixels
+from lapgs_wgpu.data.images import Pixels, Size
 from lapgs_wgpu.errors import InputError
 
 Array = NDArray[np.float64]
@@ -37,6 +37,11 @@ class Lens:
     skew: float = 0.0
     radial: tuple[float, float, float] = (0.0, 0.0, 0.0)
     tangential: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def size(self) -> Size:
+        """(width, height)."""
+        return self.width, self.height
 
     @property
     def K(self) -> Array:  # noqa: N802

@@ -233,7 +233,7 @@ def _cameras(capture: Capture, size: Size) -> tuple[list[Camera], dict[Lens, Und
             undistortions[lens] = Undistortion(resized, resized.pinhole(frame.where))
         key = (lens, frame.T_cam_world.tobytes()) if capture.shares_cameras else index
         if key not in made:
-            K, taken = (lens.K, (lens.width, lens.height)) if lens.is_pinhole else (undistortions[lens].K, stored)
+            K, taken = (lens.K, lens.size) if lens.is_pinhole else (undistortions[lens].K, stored)
             made[key] = Camera(K, frame.T_cam_world, *taken).resized(*size)
         cameras.append(made[key])
     return cameras, undistortions

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.data.capture_files import CaptureFiles
 from lapgs_wgpu.data.evenly import evenly
-from lapgs_wgpu.data.images import NEAREST, Pixels, Size, check_image, decode, resize, shrink, size_text
+from lapgs_wgpu.data.images import NEAREST, Pixels, Size, check_image, decode, resize, scales_to, shrink, size_text
 from lapgs_wgpu.data.lens import Undistortion
 from lapgs_wgpu.errors import InputError
 
@@ -57,7 +57,7 @@ def find_masks(folder: Path, names: Iterable[str], what: str) -> dict[str, Path]
 def check_mask_size(path: Path, size: Size) -> None:
     """Check that a mask has the proportions of images of (width, height). Raises InputError."""
     stored = check_image(path, whole=False).size
-    if abs(stored[0] * size[1] / size[0] - stored[1]) > 1.5:
+    if not scales_to(stored, size):
         raise InputError(
             f"{path} is {size_text(stored)} pixels, and the images are {size_text(size)}, which has other "
             "proportions; make the masks from the images."

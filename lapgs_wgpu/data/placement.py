@@ -170,13 +170,8 @@ def mover_cube(cloud: Cloud, seen: Sequence[tuple[Camera, Callable[[], Mask]]]) 
     if not boxes:
         return None
     depths = ndimage.median_filter(np.array([depth for _, (_, depth) in boxes]), MEDIAN, mode="nearest")
-    corners = np.concatenate(
-        [
-            points_at(camera, pixels, np.full(4, depth))
-            for (camera, (pixels, _)), depth in zip(boxes, depths, strict=True)
-        ]
-    )
-    low, high = corners.min(axis=0), corners.max(axis=0)
+    at = [points_at(camera, box, np.full(4, depth)) for (camera, (box, _)), depth in zip(boxes, depths, strict=True)]
+    low, high = np.concatenate(at).min(axis=0), np.concatenate(at).max(axis=0)
     return Cube((low + high) / 2, float(max(ROOM * (high - low).max() / 2, 1e-6)))
 
 

@@ -17,7 +17,7 @@ from lapgs_wgpu.data.cloud import Cloud, in_view, views_of
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.focus import FAR_APART, degrees_apart, spread
 from lapgs_wgpu.data.frames import Frame
-from lapgs_wgpu.data.images import BLURRED, EQUAL, ImageFile, Size, blurred_and_repeated, decode, size_text
+from lapgs_wgpu.data.images import BLURRED, EQUAL, ImageFile, Size, blurred_and_repeated, decode, scales_to, size_text
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.placement import near_focus
 from lapgs_wgpu.data.poses import AXES_HINT
@@ -45,7 +45,7 @@ def upright(frames: Sequence[Frame]) -> tuple[list[Frame], list[str]]:
     for frame in frames:
         image = frame.image
         if image.orientation > 1:
-            stored, shown = (_fits(size, frame.lens) for size in (image.size, image.turned.size))
+            stored, shown = (scales_to(size, frame.lens.size) for size in (image.size, image.turned.size))
             if shown and not stored:
                 frame = dataclasses.replace(frame, image=image.turned)
             elif shown == stored or not frame.states_size:
@@ -74,7 +74,7 @@ def check_plausible(frames: Sequence[Frame]) -> list[str]:
         lens, where = next(reversed(off.items()))
         warnings.append(
             f"{where}: the principal point ({lens.cx:.5g}, {lens.cy:.5g}) is far from the middle of images of "
-            f"{lens.width}x{lens.height}, in {len(off)} cameras; unless the images were cut out of larger ones, the "
+            f"{size_text(lens.size)}, in {len(off)} cameras; unless the images were cut out of larger ones, the "
             "intrinsics are those of another size, or in other units than pixels."
         )
     images = [frame.image for frame in frames]
@@ -98,9 +98,10 @@ def _black_cameras(frames: Sequence[Frame]) -> list[str]:
     if not black:
         return []
     advice = "leave them out" if len(several) > 1 else "give brighter images"
+    looked_at = several[black[0]]
     return [
-        f"{len(black)} of {len(several)} cameras are black, such as {black[0]}: in {len(several[black[0]])} of its "
-        f"{len(by_camera[black[0]])} images, such as {several[black[0]][0]}, no level reaches {BLACK}: {advice}."
+        f"{len(black)} of {len(several)} cameras are black, such as {black[0]}: in {len(looked_at)} of its "
+        f"{len(by_camera[black[0]])} images, such as {looked_at[0]}, no level reaches {BLACK}: {advice}."
     ]
 
 
@@ -112,12 +113,6 @@ def _low_levels(images: Sequence[ImageFile], channels: slice, what: str, of: str
         return None
     told = f"{what}: in {len(looked_at)} of {len(images)}, such as {looked_at[0]}, no {of} is above {highest} of 255"
     return told, highest
-
-
-def _fits(size: Size, lens: Lens) -> bool:
-    """Whether an image of (width, height) has the proportions that a lens states."""
-    # Whoever shrank the images may have rounded each side up or down.
-    return abs(size[0] * lens.height / lens.width - size[1]) <= 1.5
 
 
 def check_frames(frames: Sequence[Frame]) -> None:
@@ -137,15 +132,15 @@ def check_frames(frames: Sequence[Frame]) -> None:
 
 def _check_lens(lens: Lens, size: Size, image: str, where: str) -> None:
     """Check that focal lengths are plausible, and that an image of (width, height) has the lens's proportions."""
-    stated, longer = f"{lens.width}x{lens.height}", max(lens.width, lens.height)
+    stated, longer = size_text(lens.size), max(lens.size)
     for focal in (lens.fx, lens.fy):
         if not MIN_FOCAL * longer <= focal <= MAX_FOCAL * longer:
             raise InputError(
                 f"{where}: a focal length of {focal:.4g} pixels does not fit images of {stated}; it must be "
                 f"{MIN_FOCAL:g} to {MAX_FOCAL:g} times the longer side, in pixels of that size."
             )
-    if not _fits(size, lens):
-        sideways = _fits(size[::-1], lens)
+    if not scales_to(size, lens.size):
+        sideways = scales_to(size[::-1], lens.size)
         advice = "turn it, or give the camera of the turned image" if sideways else "give the camera of this image"
         raise InputError(
             f"{image} is {size_text(size)} pixels, but {where} states {stated}, which has other proportions"
@@ -314,18 +309,15 @@ def check_film(images: Sequence[Path]) -> list[str]:
     if len(images) < 3:
         return []
     blurry, repeated = ([image.name for image in bad] for bad in blurred_and_repeated(images))
-    why = {
-        "blurred": (blurry, f"have less than {BLURRED:g} of their neighbours' sharpness"),
-        "repeated": (
-            repeated,
-            f"differ by at most {EQUAL} of 255 levels from the one before: motion stands still",
-        ),
-    }
+    found = (
+        ("blurred", blurry, f"have less than {BLURRED:g} of their neighbours' sharpness"),
+        ("repeated", repeated, f"differ by at most {EQUAL} of 255 levels from the one before: motion stands still"),
+    )
     # Where so many are left out, what names them must not stay.
     return [
         f"{word} images: {_named(names)} ({len(names)} of {len(images)}) {reason}; leave them out"
         f"{', and what names them' if len(names) > MOST_ABSENT * len(images) else ''}."
-        for word, (names, reason) in why.items()
+        for word, names, reason in found
         if names
     ]
 

@@ -168,24 +168,22 @@ def small_views(views: Sequence[View], size: int) -> list[View]:
     Views that share a camera still share one, and each image is read once.
     """
     cameras: dict[Camera, Camera] = {}
-    shrunk_views = []
-    for view in views:
+
+    def shrunk(view: View) -> View:
         width, height = view.camera.width, view.camera.height
         scale = size / max(width, height)
         if scale >= 1:
-            shrunk_views.append(view)
-            continue
+            return view
         small = max(1, round(scale * width)), max(1, round(scale * height))
-        camera = cameras.setdefault(view.camera, view.camera.resized(*small))
-        ignored = None if view.ignored is None else partial(_shrunk_mask, view.ignored, small)
-        moving = None if view.moving is None else cache(partial(_shrunk_mask, view.moving, small, MOSTLY))
-        pixels = cache(partial(_shrunk, view, small))
-        shrunk_views.append(dataclasses.replace(view, camera=camera, pixels=pixels, ignored=ignored, moving=moving))
-    return shrunk_views
+        return dataclasses.replace(
+            view,
+            camera=cameras.setdefault(view.camera, view.camera.resized(*small)),
+            pixels=cache(lambda: shrink(view.load(), small)),
+            ignored=None if view.ignored is None else partial(_shrunk_mask, view.ignored, small),
+            moving=None if view.moving is None else cache(partial(_shrunk_mask, view.moving, small, MOSTLY)),
+        )
 
-
-def _shrunk(view: View, size: Size) -> NDArray[np.uint8]:
-    return shrink(view.load(), size)
+    return [shrunk(view) for view in views]
 
 
 def _shrunk_mask(mask: Callable[[], NDArray[np.bool_]], size: Size, above: int = 0) -> NDArray[np.bool_]:
