@@ -30,7 +30,7 @@ def read(folder: Path, image_size: int | None) -> Capture:
     lens = lens_of(cameras(1)[0], 0.1)
     for file, camera in zip(sorted(folder.glob("*.png")), cameras(COUNT), strict=True):
         frames.append(Frame(check_image(file), lens, camera.T_cam_world, str(file), ImageName(file.name)))
-    return Capture(frames, None, folder)
+    return Capture(frames, folder)
 
 
 @pytest.fixture

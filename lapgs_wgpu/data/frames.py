@@ -67,8 +67,8 @@ class Capture:
     """Frames and cloud of a capture.
 
     frames: at least one. The order is that of the views.
-    cloud: in the coordinates of the frames.
     source: file of the cloud or, without a cloud, of the cameras, for errors.
+    cloud: in the coordinates of the frames.
     time_source: file and field of the times, for errors.
     time_range: times that become 0 and 1; None for the first and the last time of the frames.
     warnings: what the reader left out, one sentence each.
@@ -81,8 +81,8 @@ class Capture:
     """
 
     frames: Sequence[Frame]
-    cloud: Cloud | None
     source: Path
+    cloud: Cloud | None = None
     time_source: str = ""
     time_range: tuple[float, float] | None = None
     warnings: Sequence[str] = ()

@@ -10,12 +10,12 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path, PurePath
-from typing import get_args
 
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import SUFFIXES, Pixels, Size, shrink, shrunk_size
 from lapgs_wgpu.data.lens import Lens, Undistortion
 from lapgs_wgpu.data.masks import MOSTLY, Mask, MaskKind, check_masks, find_masks, read_mask
+from lapgs_wgpu.data.normalize import Normalization
 from lapgs_wgpu.data.placement import mover_cube, place
 from lapgs_wgpu.data.readers import apps, colmap, hypernerf, panoptic, poses_bounds, transforms
 from lapgs_wgpu.data.stamps import natural_key
@@ -86,10 +86,8 @@ def load_dataset(
         by_time = sorted(training, key=lambda pair: pair[1].time or 0.0)
         seen = [(c, _view(frame, 0, c, undistortions[frame.lens]).moving) for c, frame in by_time]
         moving = mover_cube(capture.cloud, [(camera, mask) for camera, mask in seen if mask is not None])
-    trained = [frame for _, frame in training]
-    placement = place(capture, trained, training_cameras, moving=moving)
+    placement = place(capture, training_cameras, moving)
     warnings += placement.warnings
-    summary = _summary(reader.name, capture, cameras, time_source)
 
     fit = placement.normalization
     whole = fit if fit is None or capture.moved is None else capture.moved.then(fit)
@@ -119,14 +117,14 @@ def load_dataset(
         warnings=tuple(warnings),
         time_source=time_source,
         own_footage=capture.own_footage,
-        summary=summary
-        + ("; coordinates are kept" if whole is None else f"; 1 unit of the files becomes {whole.scale:.4g}")
-        + (f"; {capture.left_out} left out" if capture.left_out else ""),
+        summary=_summary(reader.name, capture, cameras, time_source, whole),
     )
 
 
-def _summary(layout: str, capture: Capture, cameras: Sequence[Camera], time_source: str) -> str:
-    """Say how a capture was understood: layout, cameras, times and their source, what is held out."""
+def _summary(
+    layout: str, capture: Capture, cameras: Sequence[Camera], time_source: str, moved: Normalization | None
+) -> str:
+    """Say how a capture was understood: layout, cameras, times and their source, what is held out, its scale."""
     films = by_camera([frame.name for frame in capture.frames])
     folders = len({PurePath(frame.name.file).parent for frame in capture.frames})
     held = [frame.name.camera for frame in capture.frames if frame.split != "train"]
@@ -141,7 +139,9 @@ def _summary(layout: str, capture: Capture, cameras: Sequence[Camera], time_sour
     whole = len(films) > 1 and len(set(held)) == 1 and len(films[held[0]]) == len(held)
     out = f"{held[0]} is" if whole else f"{len(held)} of {len(cameras)} images are"
     times = len({frame.time for frame in capture.frames})
-    return f"{layout}, {told}, {times} times from {time_source}; {out} held out"
+    scale = "coordinates are kept" if moved is None else f"1 unit of the files becomes {moved.scale:.4g}"
+    left_out = f"; {capture.left_out} left out" if capture.left_out else ""
+    return f"{layout}, {told}, {times} times from {time_source}; {out} held out; {scale}{left_out}"
 
 
 def _reader(folder: Path) -> Reader:
@@ -208,12 +208,10 @@ def _masked(frames: Sequence[Frame], masks: Path | None, movers: Path | None) ->
 
 
 def _check_masks(frames: Sequence[Frame]) -> list[str]:
-    size, warnings = frames[0].image.size, list[str]()
-    for kind in get_args(MaskKind):
-        of_kind = [frame for frame in frames if frame.mask_kind == kind and frame.split == "train"]
-        warnings += check_masks({f.name.file: f.mask for f in of_kind if f.mask is not None}, size, kind)
+    size, kind = frames[0].image.size, frames[0].mask_kind
+    ignored = {frame.name.file: frame.mask for frame in frames if frame.split == "train" and frame.mask is not None}
     moving = {frame.name.file: frame.moving for frame in frames if frame.moving is not None}
-    return warnings + check_masks(moving, size, "white", movers=True)
+    return check_masks(ignored, size, kind) + check_masks(moving, size, "white", movers=True)
 
 
 def _cameras(capture: Capture, size: Size) -> tuple[list[Camera], dict[Lens, Undistortion]]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lapgs_wgpu.data.cloud import Cloud, in_view, points_at, points_in_view, views_of
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.focus import are_parallel, focus_of
-from lapgs_wgpu.data.frames import Capture, Frame
+from lapgs_wgpu.data.frames import Capture
 from lapgs_wgpu.data.masks import Mask
 from lapgs_wgpu.data.normalize import BOX, Cube, Normalization, cube_in_view, cube_of_points
 from lapgs_wgpu.data.poses import AXES_HINT, Array
@@ -40,20 +40,13 @@ class Placement(NamedTuple):
     warnings: list[str]
 
 
-def place(
-    capture: Capture,
-    training: Sequence[Frame],
-    cameras: Sequence[Camera],
-    *,
-    moving: Cube | None = None,
-) -> Placement:
+def place(capture: Capture, cameras: Sequence[Camera], moving: Cube | None) -> Placement:
     """Determine the cube that a capture fills, and bring cloud and depths into the world's coordinates.
 
-    training: its training frames. cameras: the distinct cameras of these, in the capture's coordinates. moving: the
-    cube of what moves, in these, too; None for that of the whole scene. Raises InputError where nothing tells where the
-    scene is.
+    cameras: the distinct training cameras, in the capture's coordinates. moving: the cube of what moves, in these, too;
+    None for that of the whole scene. Raises InputError where nothing tells where the scene is.
     """
-    depths, warnings = _depths(capture, training, cameras)
+    depths, warnings = _depths(capture, cameras)
     cube = moving or _cube(capture, cameras, depths)
     if cube is None:
         warnings.append(
@@ -75,11 +68,9 @@ def place(
     )
 
 
-def _depths(
-    capture: Capture, training: Sequence[Frame], cameras: Sequence[Camera]
-) -> tuple[tuple[float, float] | None, list[str]]:
+def _depths(capture: Capture, cameras: Sequence[Camera]) -> tuple[tuple[float, float] | None, list[str]]:
     """Return nearest and furthest depth, if files state them or no cloud replaces them, and warnings of a guess."""
-    stated = [frame.depths for frame in training if frame.depths is not None]
+    stated = [frame.depths for frame in capture.frames if frame.split == "train" and frame.depths is not None]
     if stated:
         return (min(near for near, _ in stated), float(np.median([far for _, far in stated]))), []
     if capture.cloud is not None or capture.keeps_coordinates:

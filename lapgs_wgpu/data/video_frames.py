@@ -53,7 +53,8 @@ def frames_folder(path: Path, size: Size, shape: Display) -> Path:
     """The folder for the frames of this (width, height); size and date of the film are part of its name."""
     stat, path = path.stat(), path.resolve()
     state = f"{stat.st_size:x}-{stat.st_mtime_ns:x}" + (f"-{shape}" if any(shape) else "")
-    return cache_folder() / "frames" / _place(path.parent) / f"{path.stem}-{size[0]}x{size[1]}-{state}"
+    caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lapgs_wgpu"
+    return caches / "frames" / _place(path.parent) / f"{path.stem}-{size[0]}x{size[1]}-{state}"
 
 
 def _check_header(path: Path) -> tuple[Display, Size]:
@@ -165,11 +166,6 @@ def display(frame: Any) -> Display:
     if mirrored:  # the matrix times that of the mirror, which comes first
         a, b = -a, -b
     return Display(round(float(np.arctan2(-b, a)) / (np.pi / 2)) % 4, mirrored)
-
-
-def cache_folder() -> Path:
-    """The folder of caches: lapgs_wgpu in XDG_CACHE_HOME, else in ~/.cache."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lapgs_wgpu"
 
 
 def _place(folder: PurePath) -> str:

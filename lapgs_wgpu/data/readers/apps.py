@@ -78,7 +78,6 @@ def _read_record3d(folder: Path, image_size: int | None) -> Capture:
     warnings = [f"{images} holds {len(files)} images for {len(poses)} poses; the other poses are left out."]
     return Capture(
         frames,
-        None,
         source=path,
         time_source=f"{timed} in {path}",
         warnings=warnings if absent else [],
@@ -126,7 +125,6 @@ def _read_polycam(folder: Path, image_size: int | None) -> Capture:
         warnings.append(f"{undescribed} of {count} images in {images} have no camera and are left out.")
     return Capture(
         frames,
-        None,
         source=cameras,
         time_source=f"timestamp in {cameras}",
         warnings=warnings,

@@ -12,10 +12,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-import numpy as np
-
 from lapgs_wgpu.data.capture_files import CaptureFiles
-from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import SUFFIXES, check_image
 from lapgs_wgpu.data.poses import place_of
@@ -43,17 +40,14 @@ def _read(folder: Path, image_size: int | None) -> Capture:
     if len(models) > 1:
         sizes = ", ".join(f"{path.name} with {len(other.images)}" for path, other in models.items())
         warnings.append(f"{folder / SPARSE} holds {len(models)} models ({sizes} images): {chosen.name} is taken.")
-    cloud = None
-    if len(model.points):
-        cloud = Cloud(model.points, (model.colors / 255).astype(np.float32))
-    else:
+    if model.cloud is None:
         warnings.append(
             f"{model.points_file} holds 0 points, so Gaussians start at random depths; points make it train better."
         )
     return Capture(
         frames,
-        cloud,
         model.points_file,
+        model.cloud,
         warnings=warnings,
         left_out=len(files) - len(frames) + len(model.images) - len(registered),
         shares_cameras=True,

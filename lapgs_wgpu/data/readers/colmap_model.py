@@ -7,13 +7,14 @@ declared count reserves no memory.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.images import SUFFIXES
 from lapgs_wgpu.data.json_fields import LARGEST_ENTRY, LARGEST_INTRINSIC, LARGEST_SIDE
 from lapgs_wgpu.data.lens import Lens
@@ -51,12 +52,11 @@ class ColmapImage(NamedTuple):
 
 
 class ColmapModel(NamedTuple):
-    """cameras: by id. images: in file order. points: (N, 3), colors: (N, 3) uint8."""
+    """cameras: by id. images: in file order. cloud: with float64 points; None where there are none."""
 
     cameras: dict[int, Lens]
     images: list[ColmapImage]
-    points: Array
-    colors: NDArray[np.uint8]
+    cloud: Cloud | None
     cameras_file: Path
     images_file: Path
     points_file: Path
@@ -77,7 +77,7 @@ def read_model(folder: Path) -> ColmapModel:
     try:
         cameras = (_binary_cameras if binary else _text_cameras)(files["cameras"])
         images = (_binary_images if binary else _text_images)(files["images"])
-        points, colors = (_binary_points if binary else _text_points)(files["points3D"])
+        rows = (_binary_points if binary else _text_points)(files["points3D"])
     except OSError as error:
         raise InputError(f"{error.filename or folder} cannot be read ({error.strerror or error}).") from error
     for image in images:
@@ -85,12 +85,15 @@ def read_model(folder: Path) -> ColmapModel:
             raise InputError(
                 f"{image.where} names camera {image.camera}, none of {len(cameras)} in {files['cameras']}."
             )
+    points, colors = np.split(np.array(rows, np.float64).reshape(-1, 6), 2, axis=1)
     bad = np.flatnonzero(~(np.abs(points) <= LARGEST_ENTRY).all(axis=1))  # true for NaN, too
     if len(bad):
         raise InputError(
             f"{files['points3D']}: {len(bad)} of {len(points)} are not finite, first {bad[0]}; remove them."
         )
-    return ColmapModel(cameras, images, points, colors, *files.values())
+    levels = np.clip(np.nan_to_num(colors), 0, 255).astype(np.uint8)
+    cloud = Cloud(points, (levels / 255).astype(np.float32)) if len(points) else None
+    return ColmapModel(cameras, images, cloud, *files.values())
 
 
 def _camera(where: str, model: str, width: float, height: float, values: list[float]) -> Lens:
@@ -177,15 +180,9 @@ def _text_images(path: Path) -> list[ColmapImage]:
     return images
 
 
-def _text_points(path: Path) -> tuple[Array, NDArray[np.uint8]]:
-    rows = [_numbers(words[1:7], where) for where, words in _lines(path, "id, X, Y, Z, R, G, B, error")]
-    return _points(rows)
-
-
-def _points(rows: Sequence[Sequence[float]]) -> tuple[Array, NDArray[np.uint8]]:
-    """Places (N, 3) and colors (N, 3) of rows of X, Y, Z, R, G, B."""
-    values = np.array(rows, dtype=np.float64).reshape(-1, 6)
-    return values[:, :3], np.clip(np.nan_to_num(values[:, 3:]), 0, 255).astype(np.uint8)
+def _text_points(path: Path) -> list[Any]:
+    """Rows of X, Y, Z, R, G, B."""
+    return [_numbers(words[1:7], where) for where, words in _lines(path, "id, X, Y, Z, R, G, B, error")]
 
 
 # Binary: little-endian, each file begins with a count of 8 bytes
@@ -250,10 +247,11 @@ def _binary_images(path: Path) -> list[ColmapImage]:
     return images
 
 
-def _binary_points(path: Path) -> tuple[Array, NDArray[np.uint8]]:
+def _binary_points(path: Path) -> list[Any]:
+    """Rows of X, Y, Z, R, G, B."""
     file, rows = _Bytes(path), []
     for _ in range(file.count()):
         rows.append(file.take("Q3d3Bd")[1:7])
         file.skip(8 * file.count())
     file.end()
-    return _points(rows)
+    return rows

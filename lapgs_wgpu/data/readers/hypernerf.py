@@ -64,7 +64,7 @@ def _read(folder: Path, image_size: int | None) -> Capture:
     cloud = find_cloud(folder, CLOUDS)
     return Capture(
         frames,
-        None if cloud is None else moved.cloud(read_cloud(cloud)),
+        cloud=None if cloud is None else moved.cloud(read_cloud(cloud)),
         source=cloud or folder / "scene.json",
         time_source=f"time_id (else warp_id) in {folder / 'metadata.json'}",
         time_range=(min(times.values()), max(times.values())),

@@ -33,7 +33,6 @@ def _read(folder: Path, image_size: int | None) -> Capture:
     frames = [*_read_split(folder, train, "train", warnings), *_read_split(folder, test, "test", warnings)]
     return Capture(
         frames,
-        None,
         source=folder / FILES["train"],
         warnings=warnings,
         time_source=f"the order of the lists in {folder / FILES['train']}",

@@ -129,7 +129,7 @@ def _read_neu3d(folder: Path, image_size: int | None) -> Capture:
     cloud = find_cloud(folder, CLOUDS)
     return Capture(
         frames,
-        None if cloud is None else read_cloud(cloud),
+        cloud=None if cloud is None else read_cloud(cloud),
         source=cloud or path,
         warnings=warnings,
         time_source=f"the number of frames in {others[0]}",
@@ -195,7 +195,7 @@ def _read_endonerf(folder: Path, image_size: int | None) -> Capture:
     poses = len({frame.T_cam_world.tobytes() for frame in frames})
     return Capture(
         frames,
-        cloud,
+        cloud=cloud,
         source=path if cloud is None else folder / DEPTH,
         time_source=f"the order of the images in {folder / IMAGES}",
         warnings=[f"{folder}: {STILL.format(depth=depth) if poses == 1 else MOVING.format(count=poses)}."],

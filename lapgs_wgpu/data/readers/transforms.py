@@ -142,7 +142,7 @@ def _read_nerfstudio(folder: Path, image_size: int | None) -> Capture:
     cloud = files.optional(data, "ply_file_path")
     return Capture(
         [dataclasses.replace(frame, name=name) for frame, name in zip(frames, named, strict=True)],
-        None if cloud is None else read_cloud(cloud),
+        cloud=None if cloud is None else read_cloud(cloud),
         source=cloud or path,
         warnings=warnings,
         left_out=len(entries) - len(frames),
@@ -201,7 +201,7 @@ def _read_dnerf(folder: Path, image_size: int | None) -> Capture:
     cameras = folder / "transforms_train.json"
     return Capture(
         frames,
-        cloud,
+        cloud=cloud,
         warnings=warnings,
         source=cameras if path is None or cloud is None else path,
         time_source=f"time in {cameras}",
