@@ -309,14 +309,14 @@ def test_a_step_that_is_not_finite_is_skipped_and_named(device: Device, dataset:
 
 def spoil(passes: ResidentPasses, at: int) -> None:
     """Draw one of the steps on a background that is not finite."""
-    record, color = passes._recorded, passes._background
+    record, color = passes.record, passes._background
 
     def spoiled(commands: Commands, task: Task, *rest: Any, **how: Any) -> Recorded:
         passes._background = (math.nan,) * 3 if task.scheduled.step == at else color
         passes._recordings.clear()
         return record(commands, task, *rest, **how)
 
-    passes._recorded = spoiled
+    passes.record = spoiled
 
 
 def smaller(view: View) -> View:

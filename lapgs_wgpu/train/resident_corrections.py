@@ -65,7 +65,7 @@ class ResidentCorrections:
         """Upload what the host has had since the last step."""
         if self.on_host:
             for block, of in self._blocks.values():
-                block.arrays["value"].write(block.gather(of.state(), value=False))
+                block.arrays["value"].write(block.gather(of.state()))
         self.on_host = False
 
     @torch.no_grad()

@@ -39,8 +39,8 @@ class Block:
 
     group: of the optimizer that all values belong to; None where each tensor is a group of its own. parts: by name of a
     tensor its place. ones: whether the last column holds ones, which no step changes. moved: number of values that Adam
-    moves; the others have an optimizer of their own. moving: whether only steps with motion move them. of: the
-    Gaussians or the field, see PARTS. first: number of the part's array. arrays: by kind.
+    moves; the others have an optimizer of their own. moving: whether only steps with motion move them. first: number
+    of the part's array. arrays: by kind.
     """
 
     name: str
@@ -50,7 +50,6 @@ class Block:
     ones: bool = False
     moved: int | None = None
     moving: bool = True
-    of: str = "gaussians"
     first: int = 0
     arrays: dict[str, DeviceArray] = field(default_factory=dict)
 
@@ -59,7 +58,7 @@ class Block:
         """Number of columns with a rate of their own."""
         return self.shape[1] if self.group is None else 1
 
-    def gather(self, tensors: Mapping[str, Tensor | None], *, value: bool) -> NDArray[np.float32]:
+    def gather(self, tensors: Mapping[str, Tensor | None]) -> NDArray[np.float32]:
         """The content for the device; tensors that are None are zeros."""
         out = np.zeros(self.shape, np.float32)
         for name, place in self.parts.items():
@@ -67,8 +66,6 @@ class Block:
             if tensor is not None:
                 target = out[place]
                 target[...] = tensor.detach().numpy(force=True).reshape(target.shape)
-        if self.ones and value:
-            out[:, -1] = 1.0
         return out
 
     def scatter(self, content: NDArray[np.float32], tensors: Mapping[str, Tensor]) -> None:
@@ -85,20 +82,16 @@ class ResidentParameters:
 
     def __init__(self, scene: Scene4D, weights: FieldWeights | None, learners: Learners) -> None:
         self._device, self._pool, self._weights = scene.device, BufferPool(scene.device), weights
-        self._gaussians, self._optimizer, self._frequencies = scene.parameters, learners.optimizer, learners.frequencies
-        self._field = dict(scene.field.named_parameters()) if scene.field is not None else {}
-        self.blocks: dict[str, Block] = {}
+        self._optimizer, self._frequencies = learners.optimizer, learners.frequencies
+        field = dict(scene.field.named_parameters()) if scene.field is not None else {}
+        self._tensors: dict[str, Mapping[str, Tensor]] = {"gaussians": scene.parameters, "field": field}  # by part
+        self._blocks_of: dict[str, list[Block]] = {}  # by part
         self._arrays: dict[tuple[str, str], DeviceArray] = {}  # of all blocks together, by part and kind
         self.steps: dict[str, int] = {}
         # The parts that the host may have changed since they were pushed: their values, the optimizers' state of them.
         self.values_on_host, self.state_on_host = set(PARTS), set(PARTS)
 
     # The host's tensors and the device's arrays ----------------------------------------------------------------------
-
-    def _tensors(self, *parts: str) -> dict[str, Tensor]:
-        """By name; those of all parts if none is named."""
-        chosen = {"gaussians": self._gaussians, "field": self._field}
-        return {name: tensor for part in parts or PARTS for name, tensor in chosen[part].items()}
 
     def _lay_out(self, part: str) -> None:
         """Make arrays for the tensors of a part as they are."""
@@ -109,25 +102,28 @@ class ResidentParameters:
             array = self._arrays[part, kind] = self._pool.array(f"{part} {kind}", (size,))
             for block in blocks:
                 block.arrays[kind] = DeviceArray(array.buffer, block.shape, offset=4 * block.first)
-        self.blocks |= {block.name: block for block in blocks}
+        self._blocks_of[part] = blocks
 
     def _write(self, part: str, kind: str, tensors: Mapping[str, Tensor | None]) -> None:
         """Upload all of a kind; tensors that are None are zeros."""
         content = np.zeros(self._arrays[part, kind].shape, np.float32)
-        for block in [block for block in self.blocks.values() if block.of == part]:
-            values = block.gather(tensors, value=kind == "value").reshape(-1)
-            content[block.first : block.first + len(values)] = values
+        for block in self._blocks_of[part]:
+            values = block.gather(tensors)
+            if block.ones and kind == "value":
+                values[:, -1] = 1.0
+            content[block.first : block.first + values.size] = values.reshape(-1)
         self._arrays[part, kind].write(content)
 
     def _read(self, part: str, kind: str, into: Mapping[str, Tensor]) -> None:
         """Copy all of a kind into tensors."""
         content = self._arrays[part, kind].read()
-        for block in [block for block in self.blocks.values() if block.of == part]:
+        for block in self._blocks_of[part]:
             values = content[block.first : block.first + math.prod(block.shape)]
             block.scatter(values.reshape(block.shape), into)
 
     def _gaussians_layout(self) -> list[Block]:
-        n, every = len(self._gaussians["means"]), slice(None)
+        gaussians, every = self._tensors["gaussians"], slice(None)
+        n = len(gaussians["means"])
         columns = {"means": (0, 3), "opacity_logits": (3, 4), "quats": (4, 8), "log_scales": (8, 11)}
         geometry = {name: (every, slice(*place)) for name, place in columns.items()}
         colors = {"sh_dc": (every, slice(0, 3)), "sh_rest": (every, slice(3, SH_FLOATS))}
@@ -137,40 +133,41 @@ class ResidentParameters:
         ]
         if self._weights is not None:
             size = self._weights.dynamics
-            dynamics = {"dynamics": (every, slice(0, size))} if "dynamics" in self._gaussians else {}
+            dynamics = {"dynamics": (every, slice(0, size))} if "dynamics" in gaussians else {}
             blocks.append(Block("beside", (n, size + 1), None, dynamics, ones=True))
         return blocks
 
     def _field_layout(self) -> list[Block]:
         if self._weights is None:
             return []
-        every, tables = slice(None), {name: table for name, table in self._field.items() if name.endswith(".table")}
+        field, every = self._tensors["field"], slice(None)
         blocks = [
-            Block(name, (table.shape[0], 2), "hash", {name: (every, every)}, of="field")
-            for name, table in tables.items()
+            Block(name, (table.shape[0], 2), "hash", {name: (every, every)})
+            for name, table in field.items()
+            if name.endswith(".table")
         ]
         places, shape = self._weights.places, (self._weights.count, 1)
-        rows = {name: (slice(p.first, p.first + self._field[name].numel()), every) for name, p in places.items()}
+        rows = {name: (slice(p.first, p.first + field[name].numel()), every) for name, p in places.items()}
         moved = places[FREQUENCIES].first if FREQUENCIES in rows else None
-        return [*blocks, Block("weights", shape, "mlp", rows, moved=moved, of="field")]
+        return [*blocks, Block("weights", shape, "mlp", rows, moved=moved)]
 
     def push_values(self) -> None:
         """Upload the values that the host may have changed."""
         for part in [part for part in PARTS if part in self.values_on_host]:
             self._lay_out(part)
-            self._write(part, "value", self._tensors(part))
+            self._write(part, "value", self._tensors[part])
 
     def push(self) -> None:
         """Upload what the host may have changed; from now on the device has the newest."""
         self.push_values()
         for part in [part for part in PARTS if part in self.state_on_host]:
-            state = {name: self._optimizer.state_of(tensor) for name, tensor in self._tensors(part).items()}
+            state = {name: self._optimizer.state_of(tensor) for name, tensor in self._tensors[part].items()}
             self.steps |= {name: int(each.get("step", 0)) for name, each in state.items()}
             for kind, key in (("mean", "exp_avg"), ("square", "exp_avg_sq")):
                 self._write(part, kind, {name: each.get(key) for name, each in state.items()})
             if part == "field" and self._frequencies is not None:
                 content, self.steps[FREQUENCIES] = self._frequencies.packed()
-                self._pool.upload("frequencies", content)
+                self._frequency_state = self._pool.upload("frequencies", content)
         self.values_on_host, self.state_on_host = set(), set()
 
     @torch.no_grad()
@@ -178,14 +175,14 @@ class ResidentParameters:
         """Make torch's tensors of some parts, of all if none is named, the newest ones."""
         for part in set(parts or PARTS) - self.values_on_host:
             self.values_on_host.add(part)
-            self._read(part, "value", self._tensors(part))
+            self._read(part, "value", self._tensors[part])
 
     @torch.no_grad()
     def pull_state(self, *parts: str) -> None:
         """Make torch's state of the optimizers of some parts, of all if none is named, the newest one."""
         for part in set(parts or PARTS) - self.state_on_host:
             self.state_on_host.add(part)
-            tensors = self._tensors(part)
+            tensors = self._tensors[part]
             means, squares = ({name: torch.zeros_like(tensor) for name, tensor in tensors.items()} for _ in range(2))
             self._read(part, "mean", means)
             self._read(part, "square", squares)
@@ -193,13 +190,12 @@ class ResidentParameters:
                 if self.steps[name] and name != FREQUENCIES:
                     self._optimizer.set_state(tensor, self.steps[name], means[name], squares[name])
             if part == "field" and self._frequencies is not None:
-                content = self._pool.array("frequencies", self._state_shape).read()
-                self._frequencies.unpack(content, self.steps[FREQUENCIES])
+                self._frequencies.unpack(self._frequency_state.read(), self.steps[FREQUENCIES])
 
     @property
-    def _state_shape(self) -> tuple[int]:
-        assert self._weights is not None
-        return (self._weights.config.components + 1,)
+    def blocks(self) -> dict[str, Block]:
+        """Of the Gaussians and the field, by name."""
+        return {block.name: block for part in PARTS for block in self._blocks_of[part]}
 
     def arrays(self, kind: str) -> FieldArrays:
         """What the field computes with (kind "value"), or its gradients; the Gaussians' own for a scene without one."""
@@ -248,15 +244,9 @@ class ResidentParameters:
         return table[:first].tobytes()
 
     def record_adam(
-        self,
-        commands: Commands,
-        guard: DeviceArray,
-        rates_of: Callable[[], Mapping[str, float]],
-        frequency_rate: Callable[[], float],
-        *,
-        moving: bool,
+        self, commands: Commands, guard: DeviceArray, rates_of: Callable[[], Mapping[str, float]], *, moving: bool
     ) -> None:
-        """Record a step of the optimizers, by the rates of its groups and of the frequencies."""
+        """Record a step of the optimizers, by the rates of its groups and of FREQUENCIES."""
         kernel, first = Kernel.get(self._device, "adam"), 0
         written = self._pool.varying(f"rates {moving}", lambda: self._rates(rates_of(), moving=moving))
         rates = DeviceArray(written.buffer, (written.nbytes // 8, 2), offset=written.offset)
@@ -268,9 +258,11 @@ class ResidentParameters:
             adam = self._pool.constant(content)
             commands.dispatch(kernel, -(-count // 256), adam=adam, guard=guard, rates=rates, **arrays)
         if moving and self._frequencies is not None:
-            self._record_frequencies(commands, guard, frequency_rate)
+            self._record_frequencies(commands, guard, rates_of)
 
-    def _record_frequencies(self, commands: Commands, guard: DeviceArray, rate: Callable[[], float]) -> None:
+    def _record_frequencies(
+        self, commands: Commands, guard: DeviceArray, rates_of: Callable[[], Mapping[str, float]]
+    ) -> None:
         assert self._weights is not None
         assert self._frequencies is not None
         kernel, config = Kernel.get(self._device, "adam_frequencies"), self._weights.config
@@ -280,22 +272,19 @@ class ResidentParameters:
         bounds |= {"floor": VARIANCE_FLOOR, "spread": VARIANCE_SPREAD}
 
         def write() -> bytes:
-            corrected, factor = _corrected(rate(), self.steps[FREQUENCIES])
+            corrected, factor = _corrected(rates_of()[FREQUENCIES], self.steps[FREQUENCIES])
             return kernel.uniform("Frequencies", rate=corrected, square_factor=factor, **given, **bounds)
 
-        spectrum, state = (
-            self._pool.varying("frequencies uniform", write),
-            self._pool.array("frequencies", self._state_shape),
-        )
+        spectrum = self._pool.varying("frequencies uniform", write)
         weights = {"weights": self.flat_weights("value"), "d_weights": self.flat_weights("gradient")}
-        commands.dispatch(kernel, 1, spectrum=spectrum, guard=guard, state=state, **weights)
+        commands.dispatch(kernel, 1, spectrum=spectrum, guard=guard, state=self._frequency_state, **weights)
 
     def gradients(self) -> dict[str, list[Tensor]]:
         """Of each tensor, read back; for the text of an error."""
-        tensors = {name: torch.zeros_like(tensor) for name, tensor in self._tensors().items()}
+        gradients = {name: torch.zeros_like(t) for part in PARTS for name, t in self._tensors[part].items()}
         for part in PARTS:
-            self._read(part, "gradient", tensors)
-        return {name: [tensor] for name, tensor in tensors.items()}
+            self._read(part, "gradient", gradients)
+        return {name: [gradient] for name, gradient in gradients.items()}
 
 
 def check_finite(commands: Commands, pool: BufferPool, values: DeviceArray, bad: DeviceArray) -> None:

@@ -37,10 +37,9 @@ class Task:
     """A resident step to be taken.
 
     scheduled: what the schedule says. before, drawn: where the draws stood before its view and before its samples.
-    view: of the training. time: of the field. sh_degree: of the harmonics in use. rates: of the
-    optimizer's groups, and of the frequencies. near, near_time: the places and the time that the smoothness loss
-    compares; None in steps without it. even, even_times: those of the acceleration loss. counts: how many steps had
-    moved each tensor before.
+    view: of the training. time: of the field. sh_degree: of the harmonics in use. rates: of the optimizer's groups, and
+    of FREQUENCIES. near, near_time: the places and the time that the smoothness loss compares; None in steps without
+    it. even, even_times: those of the acceleration loss. counts: how many steps had moved each tensor before.
     """
 
     scheduled: Scheduled
@@ -50,7 +49,6 @@ class Task:
     time: float
     sh_degree: int
     rates: dict[str, float]
-    frequency_rate: float
     near: Samples | None = None
     near_time: float = 0.0
     even: Samples | None = None
@@ -60,6 +58,8 @@ class Task:
 
 # The passes of a step: its drawing, and what is read of it later.
 Recorded = tuple[Drawing, list[DeviceArray]]
+# The field at the time of a step, and for the losses of smoothness and acceleration; None where a step is without.
+Decodings = tuple[Decoding | None, Comparison | None, Line | None]
 
 
 class ResidentPasses:
@@ -107,7 +107,25 @@ class ResidentPasses:
         self.parameters.count_step(moving=task.scheduled.moving)
         held = self._losses.held(truth)
         commands.copy(truth, held)
-        return self._recorded(commands, task, held, judged=judged)
+        camera = task.view.camera
+        shape = (
+            *(task.scheduled.moving, task.scheduled.seen, task.near is None, task.even is None, judged),
+            *(task.sh_degree, camera.width, camera.height, self.rasterizer.plan_of(camera), len(self._scene)),
+            self.corrections.moves_camera,
+        )
+        self._recordings = {key: each for key, each in self._recordings.items() if each[0].holds}
+        if shape in self._recordings:
+            recording, step = self._recordings[shape]
+            step[0].camera = camera
+            commands.replay(recording)
+            return step
+        if self._device.textures:  # copies to them depend on what was done before
+            return self._record(commands, task, held, judged=judged)
+        recording = Recording(self._device)
+        with commands.taken_down(recording):
+            step = self._record(commands, task, held, judged=judged)
+        self._recordings[shape] = recording, step
+        return step
 
     def at(self, t: float, degree: int) -> Gaussians[DeviceArray]:
         """The Gaussians at a time of the field, in arrays that the next step overwrites. degree: of the harmonics."""
@@ -127,34 +145,13 @@ class ResidentPasses:
         d_image = self._losses.pool.array("d_image", (4, camera.height, camera.width))
         self.rasterizer.backward(self.rasterizer.draw_whole(drawn, camera, gradient=True), d_image)
 
-    def _recorded(self, commands: Commands, task: Task, truth: DeviceArray, *, judged: bool) -> Recorded:
-        camera, plan = task.view.camera, self.rasterizer.plan_of(task.view.camera)
-        shape = (
-            *(task.scheduled.moving, task.scheduled.seen, task.near is None, task.even is None, judged),
-            *(task.sh_degree, camera.width, camera.height, plan, len(self._scene)),
-            self.corrections.moves_camera,
-        )
-        self._recordings = {key: each for key, each in self._recordings.items() if each[0].holds}
-        if shape in self._recordings:
-            recording, step = self._recordings[shape]
-            step[0].camera = camera
-            commands.replay(recording)
-            return step
-        if self._device.textures:  # copies to them depend on what was done before
-            return self._record(commands, task, truth, judged=judged)
-        recording = Recording(self._device)
-        with commands.taken_down(recording):
-            step = self._record(commands, task, truth, judged=judged)
-        self._recordings[shape] = recording, step
-        return step
-
     def _record(self, commands: Commands, task: Task, truth: DeviceArray, *, judged: bool) -> Recorded:
         guard, bad = self.word("guard"), self.word("bad")
         totals = self._pool.array("totals", (len(TOTALS),))
         for array in (bad, totals):
             commands.clear(array)
         decodings = self._decode(commands, task)
-        drawn = self._activate(commands, task.sh_degree, decodings[0] if decodings else None)
+        drawn = self._activate(commands, task.sh_degree, decodings[0])
         corrections, weights = self.corrections, self.weights(task)
         drawing = self.rasterizer.record(commands, drawn, task.view.camera, self._background, corrections.move)
         image = corrections.expose(commands, drawing.image)
@@ -166,11 +163,11 @@ class ResidentPasses:
         self._record_end(commands, task, drawing, by_drawn, terms, judged=judged)
         return drawing, [guard, bad, terms, totals, *drawing.needed]
 
-    def _decode(self, commands: Commands, task: Task) -> tuple[Decoding, Comparison | None, Line | None] | None:
+    def _decode(self, commands: Commands, task: Task) -> Decodings:
         """Record the field; what varies from step to step is asked for anew."""
         field, values = self._field, self.parameters.arrays("value")
         if field is None or not task.scheduled.moving:
-            return None
+            return None, None, None
         decoding, comparison, line = field.decode(commands, 0, values, lambda: self._task.time), None, None
         if task.near is not None:
             near = self._of_task("near")
@@ -194,12 +191,12 @@ class ResidentPasses:
         commands: Commands,
         drawn: Gaussians[DeviceArray],
         by_drawn: GaussianGradients,
-        decodings: tuple[Decoding, Comparison | None, Line | None] | None,
+        decodings: Decodings,
         totals: DeviceArray,
     ) -> None:
         """Record the losses of motion, and the gradients of the parameters from those of what was drawn."""
         passes, field, smooth = self._activation, self._field, self._config.smoothness
-        decoding, comparison, line = decodings or (None, None, None)
+        decoding, comparison, line = decodings
         values, gradients = self.parameters.arrays("value"), self.parameters.arrays("gradient")
         if line is not None:
             accelerations = passes.acceleration(commands, line, values.geometry, drawn)
@@ -267,7 +264,6 @@ class ResidentPasses:
             arrays = {"splats": drawing.splats, "d_splats": by_drawn.splats, "statistics": self.seen()}
             seen = self._pool.constant(content)
             commands.dispatch(kernel, -(-count // 64), seen=seen, guard=guard, **arrays)
-        rates = (lambda: self._task.rates), (lambda: self._task.frequency_rate)
-        self.parameters.record_adam(commands, guard, *rates, moving=moving)
+        self.parameters.record_adam(commands, guard, lambda: self._task.rates, moving=moving)
         geometry = self.parameters.blocks["geometry"].arrays["value"]
         self.corrections.record_step(commands, guard, drawing.frames[0], geometry)

@@ -32,7 +32,7 @@ from lapgs_wgpu.train.image_metrics import psnr_of
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.motion_losses import compared_counts, even_times, near_time
 from lapgs_wgpu.train.nonfinite import Skipped, cause, check_parameters
-from lapgs_wgpu.train.resident_parameters import PARTS
+from lapgs_wgpu.train.resident_parameters import FREQUENCIES, PARTS
 from lapgs_wgpu.train.resident_passes import ResidentPasses, Task
 from lapgs_wgpu.train.step_result import Measured, Scheduled
 from lapgs_wgpu.train.view_order import Draws
@@ -155,9 +155,10 @@ class ResidentStep:
     def _task(self, scheduled: Scheduled, sh_degree: int) -> Task:
         step, draws, frequencies = scheduled.step, self._draws, self._learners.frequencies
         before, view, drawn = draws.mark(), draws.next(), draws.mark()
-        rates, time = self._learners.optimizer.rates_at(step, scheduled.share), self._scene.timing(view.time)
-        frequency_rate = frequencies.rate.at(step) if frequencies else 0.0
-        task = Task(scheduled, before, drawn, view, time, sh_degree, rates, frequency_rate)
+        rates = self._learners.optimizer.rates_at(step, scheduled.share)
+        if frequencies is not None:
+            rates[FREQUENCIES] = frequencies.rate.at(step)
+        task = Task(scheduled, before, drawn, view, self._scene.timing(view.time), sh_degree, rates)
         if self._passes.moves:
             self._draw(task, draws.generator)
         self._truth.prefetch([view, *draws.coming(AHEAD)])
@@ -210,7 +211,7 @@ class ResidentStep:
         behind = self._ground()
         if told.bad & _OVERFLOW:
             self._passes.rasterizer.grow_on_overflow(first.drawing, told.needed)
-            self._again(behind)
+            self._flying.extend(self._submit(each) for each in behind)
             return
         # Not finite. The gradients are gone that were: this step alone once more, behind the closed guard.
         self._passes.word("guard").write(np.array([first.task.scheduled.step], np.uint32))
@@ -234,7 +235,7 @@ class ResidentStep:
         for each in behind[1:]:
             each.task = self._task(each.task.scheduled, each.task.sh_degree)
         self._push()
-        self._again(behind[1:])
+        self._flying.extend(self._submit(each) for each in behind[1:])
 
     def _ground(self) -> list[Flying]:
         """All steps in flight, which have changed nothing; none is in flight any more, and the guard is open."""
@@ -245,10 +246,6 @@ class ResidentStep:
         self._passes.word("guard").write(np.zeros(1, np.uint32))
         self.parameters.steps = dict(behind[0].task.counts)
         return behind
-
-    def _again(self, steps: list[Flying]) -> None:
-        for each in steps:
-            self._flying.append(self._submit(each))
 
     def _told(self, flying: Flying) -> _Told:
         guard, bad, terms, totals, *needed = flying.later.read()
