@@ -179,7 +179,7 @@ def test_gray_of_sixteen_bits(tmp_path: Path) -> None:
         capture(tmp_path / "gray", lambda _, p: Image.fromarray(levels.astype(np.uint16) * 257).save(p))
     )
     np.testing.assert_array_equal(data.train[0].load()[..., 1], levels)
-    np.testing.assert_array_equal(gray_thumbnail(Path(data.train[0].source), WIDTH), levels)
+    np.testing.assert_array_equal(gray_thumbnail(Path(data.train[0].source)), levels)
 
 
 @pytest.mark.parametrize(("alpha", "clear"), [(0, True), (1, True), (255, False)])

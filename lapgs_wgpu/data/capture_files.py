@@ -76,10 +76,7 @@ class CaptureFiles:
         return found
 
     def image(self, entry: Fields, field: str) -> tuple[str, ImageFile] | None:
-        """Return the path below the folder and the checked file of an entry's image, None as `find_image`.
-
-        Raises InputError.
-        """
+        """The path in the folder and the checked file of an entry's image; None as `find_image`. Raises InputError."""
         name = self.find_image(self._text(entry, field), f"{entry.where} names it as {field}")
         return None if name is None else (name, check_image(self.folder / name))
 
@@ -108,10 +105,7 @@ class CaptureFiles:
         return [f"{told}, and their frames are left out: {self.absent[0]}."]
 
     def _text(self, entry: Fields, field: str) -> str:
-        """Return a path whose file, if there is one, lies below the folder; symbolic links may lead out.
-
-        Raises InputError.
-        """
+        """A path whose file, if there is one, lies below the folder; symbolic links may lead out. Raises InputError."""
         name = entry.required(field)
         if not isinstance(name, str) or not name:
             raise InputError(f"{entry.where}: {field} must be the path of a file, got {kind(name)}.")

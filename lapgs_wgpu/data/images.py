@@ -161,12 +161,13 @@ def decode_gray(path: Path) -> NDArray[Any]:
         return np.asarray(file)
 
 
-def gray_thumbnail(path: Path, side: int) -> NDArray[np.float32]:
-    """Gray levels 0 to 255 of a small version of an image, its longer side at most `side`. Raises InputError."""
+def gray_thumbnail(path: Path) -> NDArray[np.float32]:
+    """Gray levels 0 to 255 of a small version of an image, its longer side at most THUMBNAIL. Raises InputError."""
+    size = THUMBNAIL, THUMBNAIL
     with _decoding(path), Image.open(path, formats=_FORMATS) as file:
-        file.draft("L", (side, side))
+        file.draft("L", size)
         image = (file if file.mode[0] != "I" else Image.fromarray(decode(path))).convert("L")  # 16 bits of gray
-        image.thumbnail((side, side), Image.Resampling.BOX)
+        image.thumbnail(size, Image.Resampling.BOX)
         return np.asarray(image, dtype=np.float32)
 
 
@@ -195,7 +196,7 @@ def blurred_and_repeated(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]
     """The images of one camera, in the order of time, that are blurred, and those that repeat the one before. Raises
     InputError."""
     with ThreadPoolExecutor(4, thread_name_prefix="thumbnails") as pool:
-        gray = list(pool.map(lambda path: gray_thumbnail(path, THUMBNAIL), paths))
+        gray = list(pool.map(gray_thumbnail, paths))
     soft = blurred(np.array([sharpness(each) for each in gray]))
     repeated = [path for path, (before, now) in zip(paths[1:], pairwise(gray), strict=True) if repeats(now, before)]
     return [path for path, bad in zip(paths, soft, strict=True) if bad], repeated

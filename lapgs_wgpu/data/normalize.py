@@ -13,7 +13,7 @@ import numpy as np
 
 from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.focus import focus_of
-from lapgs_wgpu.data.poses import Array, world_to_camera
+from lapgs_wgpu.data.poses import Array, place_of, world_to_camera
 from lapgs_wgpu.splat.camera import Camera
 
 BOX = 1.3  # half side of the cube: D-NeRF's scenes lie in it
@@ -40,8 +40,7 @@ class Normalization(NamedTuple):
 
     def pose(self, T_cam_world: Array) -> Array:
         """Transform a pose (4, 4)."""
-        R, t = T_cam_world[:3, :3], T_cam_world[:3, 3]
-        return world_to_camera(R.T, self.points(-R.T @ t))
+        return world_to_camera(T_cam_world[:3, :3].T, self.points(place_of(T_cam_world)))
 
     def camera(self, camera: Camera) -> Camera:
         """Transform a camera."""

@@ -108,7 +108,7 @@ def frame_numbers(names: Sequence[ImageName]) -> list[int]:
 
     Raises InputError if no number differs, or more than one.
     """
-    number_of: dict[int, int] = {}
+    found = [0] * len(names)
     for mine in by_camera(names).values():
         files = [names[i].file for i in mine]
         rows = [[int(digits) for digits in re.findall(r"\d+", names[i].stamp)] for i in mine]
@@ -133,14 +133,14 @@ def frame_numbers(names: Sequence[ImageName]) -> list[int]:
         column = varying[0] if varying else len(rows[0]) - 1
         numbers: dict[int, str] = {}
         for i, file, row in zip(mine, files, rows, strict=True):
-            number_of[i] = row[column]
+            found[i] = row[column]
             if row[column] in numbers:
                 raise InputError(
                     f"{file} has the frame number {row[column]}, as {numbers[row[column]]} has; rename one, or "
                     "put the images of each camera into a folder of their own."
                 )
             numbers[row[column]] = file
-    return [number_of[i] for i in range(len(names))]
+    return found
 
 
 def disorder(names: Sequence[ImageName], times: Sequence[float], *, numbered: bool) -> list[str]:

@@ -17,7 +17,7 @@ from lapgs_wgpu.data.cloud import Cloud, in_view, views_of
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.focus import FAR_APART, degrees_apart, spread
 from lapgs_wgpu.data.frames import Frame
-from lapgs_wgpu.data.images import BLURRED, EQUAL, ImageFile, Size, blurred_and_repeated, decode, scales_to, size_text
+from lapgs_wgpu.data.images import BLURRED, EQUAL, ImageFile, blurred_and_repeated, decode, scales_to, size_text
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.placement import near_focus
 from lapgs_wgpu.data.poses import AXES_HINT
@@ -64,12 +64,7 @@ def check_plausible(frames: Sequence[Frame]) -> list[str]:
     """Warn about principal points far from the image's middle, and about images that are nearly black or transparent:
     those of 16 bits that use fewer, and those with alpha."""
     warnings = []
-    lenses = {frame.lens: frame.where for frame in reversed(frames)}
-    off = {
-        lens: where
-        for lens, where in lenses.items()
-        if max(abs(lens.cx / lens.width - 0.5), abs(lens.cy / lens.height - 0.5)) > OFF_CENTER
-    }
+    off = {frame.lens: frame.where for frame in reversed(frames) if _is_off_center(frame.lens)}
     if off:
         lens, where = next(reversed(off.items()))
         warnings.append(
@@ -86,6 +81,10 @@ def check_plausible(frames: Sequence[Frame]) -> list[str]:
     if told := _low_levels(transparent, slice(3, 4), "images are nearly transparent", "alpha"):
         warnings.append(f"{told[0]}, and transparent pixels count as background; save the images without alpha.")
     return warnings + _black_cameras(frames)
+
+
+def _is_off_center(lens: Lens) -> bool:
+    return max(abs(lens.cx / lens.width - 0.5), abs(lens.cy / lens.height - 0.5)) > OFF_CENTER
 
 
 def _black_cameras(frames: Sequence[Frame]) -> list[str]:
@@ -127,11 +126,12 @@ def check_frames(frames: Sequence[Frame]) -> None:
             )
         if frame.lens not in checked:
             checked.add(frame.lens)
-            _check_lens(frame.lens, first.size, str(frame.image), frame.where)
+            _check_lens(frame)
 
 
-def _check_lens(lens: Lens, size: Size, image: str, where: str) -> None:
-    """Check that focal lengths are plausible, and that an image of (width, height) has the lens's proportions."""
+def _check_lens(frame: Frame) -> None:
+    """Check that focal lengths are plausible, and that the image has the lens's proportions."""
+    lens, size, where = frame.lens, frame.image.size, frame.where
     stated, longer = size_text(lens.size), max(lens.size)
     for focal in (lens.fx, lens.fy):
         if not MIN_FOCAL * longer <= focal <= MAX_FOCAL * longer:
@@ -143,7 +143,7 @@ def _check_lens(lens: Lens, size: Size, image: str, where: str) -> None:
         sideways = scales_to(size[::-1], lens.size)
         advice = "turn it, or give the camera of the turned image" if sideways else "give the camera of this image"
         raise InputError(
-            f"{image} is {size_text(size)} pixels, but {where} states {stated}, which has other proportions"
+            f"{frame.image} is {size_text(size)} pixels, but {where} states {stated}, which has other proportions"
             f"{', those of the image on its side' if sideways else ''}; {advice}."
         )
 
@@ -270,10 +270,8 @@ def check_views(cloud: Cloud, cameras: Sequence[Camera], names: Sequence[str], w
     """
     first_name = dict(zip(reversed(cameras), reversed(names), strict=True))
     cameras = list(dict.fromkeys(cameras))
-    names = [first_name[camera] for camera in cameras]
     points = cloud.points.astype(np.float64)
-    seen = np.array([views_of(points, [camera]).sum() for camera in cameras])
-    blind = np.flatnonzero(seen == 0).tolist()
+    blind = [first_name[camera] for camera in cameras if not views_of(points, [camera]).any()]
     if 2 * len(blind) > len(cameras):
         back = [Camera(c.K, np.diag([1.0, -1, -1, 1]) @ c.T_cam_world, c.width, c.height) for c in cameras]
         turned = float(np.mean([views_of(points, [camera]).any() for camera in back]))
@@ -283,9 +281,9 @@ def check_views(cloud: Cloud, cameras: Sequence[Camera], names: Sequence[str], w
             f"points{hint or '; cloud and cameras have different coordinates or scales'}."
         )
     warnings = []
-    if len(blind):
+    if blind:
         warnings.append(
-            f"cameras look away from the cloud: {_named([names[i] for i in blind])} see none of its {len(points)} "
+            f"cameras look away from the cloud: {_named(blind)} see none of its {len(points)} "
             f"points ({len(blind)} of {len(cameras)} cameras); their poses may be wrong."
         )
     if len(points) < FEW_POINTS:

@@ -39,14 +39,14 @@ def _read(folder: Path, image_size: int | None) -> Capture:
     times = _times(_object(folder / "metadata.json"), ids)
     rgb = _image_folder(folder / "rgb", train_ids + test_ids, image_size)
     files = CaptureFiles(rgb)
-    images = {name: files.find_image(f"{name}.png", f"dataset.json names {name}") for name in train_ids + test_ids}
-    splits: list[tuple[Split, list[str]]] = [("train", train_ids), ("test", test_ids)]
+    splits: dict[Split, list[str]] = {"train": train_ids, "test": test_ids}
     frames = []
-    for split, names in splits:
+    for split, names in splits.items():
         for index, name in enumerate(names):
-            image, where = images[name], folder / "camera" / f"{name}.json"
+            image = files.find_image(f"{name}.png", f"dataset.json names {name}")
             if image is None:
                 continue
+            where = folder / "camera" / f"{name}.json"
             lens, pose = _read_camera(_object(where))
             frames.append(
                 Frame(

@@ -15,16 +15,12 @@ from lapgs_wgpu.data.capture_files import CaptureFiles
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, Fields, kind, matrix, read_json
 from lapgs_wgpu.data.lens import Lens
-from lapgs_wgpu.data.poses import Array, check_rotation, world_to_camera
+from lapgs_wgpu.data.poses import Array, check_rotation, place_of, world_to_camera
 from lapgs_wgpu.data.stamps import ImageName
 from lapgs_wgpu.errors import InputError
 
 IMAGES = "ims"
 FILES: dict[Split, str] = {"train": "train_meta.json", "test": "test_meta.json"}
-
-
-def _matches(folder: Path) -> bool:
-    return (folder / FILES["train"]).is_file()
 
 
 def _read(folder: Path, image_size: int | None) -> Capture:
@@ -82,7 +78,8 @@ def _pose(w2c: object, where: str) -> Array:
     """(4, 4) of a field w2c. Raises InputError."""
     T = matrix(w2c, (4, 4), "w2c", where)
     check_rotation(T[:3, :3], f"{where}: w2c")
-    return world_to_camera(T[:3, :3].T, -T[:3, :3].T @ T[:3, 3])
+    return world_to_camera(T[:3, :3].T, place_of(T))
 
 
-READERS = (Reader("Panoptic", "train_meta.json and test_meta.json beside ims/", _matches, _read),)
+LAYOUT = "train_meta.json and test_meta.json beside ims/"
+READERS = (Reader("Panoptic", LAYOUT, lambda folder: (folder / FILES["train"]).is_file(), _read),)
