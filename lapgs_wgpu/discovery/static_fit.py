@@ -44,7 +44,7 @@ VALUES = {
     "loss.pyramid": 0.0,
     "loss.ncc": 0.0,
     "loss.dynamics": 0.0,
-    "schedule.cool_down": 0,
+    "schedule.cool_down": 0.0,
     "smoothness.share": 0.0,
     "acceleration.weight": 0.0,
     "step_place": "auto",

@@ -73,7 +73,9 @@ class ScheduleConfig(Options):
     )
     sh_interval: int = option("the degree of the spherical harmonics rises by one every N steps, up to 3", at_least=1)
     save_interval: int = option("save the state for --resume every N steps; 0: only if the training is interrupted")
-    cool_down: int = option("number of last steps over which the learning rates fall in a straight line to 0", 0)
+    cool_down: float = option(
+        "fraction of the steps, the last, over which the learning rates fall in a straight line to 0", 0.0, at_most=1
+    )
 
 
 @dataclass(frozen=True)

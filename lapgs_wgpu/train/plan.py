@@ -41,7 +41,6 @@ LENGTHS = (
     *(f"density.{name}" for name in ("start", "stop", "interval", "reset_interval", "contribution_interval")),
     *("timing.start", "timing.interval", "discovery.steps", "discovery.field_steps"),
 )
-LENGTHS_OR_ZERO = "smoothness.start", "schedule.cool_down"
 UNTIMED_STEPS, TIMED_STEPS = 4, 8  # the first ones compile kernels; multiples of acceleration.interval
 
 
@@ -130,6 +129,7 @@ def plan_training(
 def scale_schedule(config: Config, steps: int) -> Config:
     """The configuration with `steps` steps, and all its schedules as much shorter or longer."""
     factor = steps / config.schedule.steps
-    lengths = {key: factor * operator.attrgetter(key)(config) for key in (*LENGTHS, *LENGTHS_OR_ZERO)}
-    scaled = {key: max(int(key in LENGTHS), round(length)) for key, length in lengths.items()}
-    return changed(config, scaled | {"schedule.steps": steps})
+    scaled = {key: max(1, round(factor * operator.attrgetter(key)(config))) for key in LENGTHS}
+    return changed(
+        config, scaled | {"schedule.steps": steps, "smoothness.start": round(factor * config.smoothness.start)}
+    )

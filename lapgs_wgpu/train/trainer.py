@@ -225,8 +225,8 @@ class Trainer:
 
     def _share_of_rates(self, step: int) -> float:
         """Which share of its learning rates a step has: they rise over the first steps, and fall over the last."""
-        rising, falling = self._ramp_steps, self.config.schedule.cool_down
-        left = self.config.schedule.steps - step + 1
+        rising, steps = self._ramp_steps, self.config.schedule.steps
+        falling, left = self.config.schedule.cool_down * steps, steps - step + 1
         return min(1.0, step / rising if rising else 1.0, left / falling if falling else 1.0)
 
     def _note(self, skipped: Skipped | None) -> None:
