@@ -33,7 +33,7 @@ from lapgs_wgpu.progress import say
 LENS = "RADIAL"
 FEWEST, WHOLE = 0.3, 0.9  # of the images need a pose; of fewer than this only a part of the film fits
 LITTLE, MUCH = 0.002, 0.15  # share of the images: less motion needs no masks; more may have led the cameras astray
-FOLLOWED = 0.8  # share of the image area where flow must tell whether it moves; of less the user is told
+FOLLOWED = 0.8  # least share of the image area in which the flow tells whether it moves; below it, a warning
 AGAIN = 0.98  # of the area that was explained before, at least, by cameras without what moves
 STANDING = 4e-3  # of the longer side: the image of a camera that stands still moves less over the film
 FEATURES, SHARED = 200, 60  # of an image; in common with the next one: fewer say why cameras are not found
