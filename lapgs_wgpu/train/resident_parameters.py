@@ -83,8 +83,8 @@ class ResidentParameters:
     def __init__(self, scene: Scene4D, weights: FieldWeights | None, learners: Learners) -> None:
         self._device, self._pool, self._weights = scene.device, BufferPool(scene.device), weights
         self._optimizer, self._frequencies = learners.optimizer, learners.frequencies
-        field = dict(scene.field.named_parameters()) if scene.field is not None else {}
-        self._tensors: dict[str, Mapping[str, Tensor]] = {"gaussians": scene.parameters, "field": field}  # by part
+        tensors = dict(scene.field.named_parameters()) if scene.field is not None else {}
+        self._tensors: dict[str, Mapping[str, Tensor]] = {"gaussians": scene.parameters, "field": tensors}  # by part
         self._blocks_of: dict[str, list[Block]] = {}  # by part
         self._arrays: dict[tuple[str, str], DeviceArray] = {}  # of all blocks together, by part and kind
         self.steps: dict[str, int] = {}
@@ -140,14 +140,14 @@ class ResidentParameters:
     def _field_layout(self) -> list[Block]:
         if self._weights is None:
             return []
-        field, every = self._tensors["field"], slice(None)
+        tensors, every = self._tensors["field"], slice(None)
         blocks = [
             Block(name, (table.shape[0], 2), "hash", {name: (every, every)})
-            for name, table in field.items()
+            for name, table in tensors.items()
             if name.endswith(".table")
         ]
         places, shape = self._weights.places, (self._weights.count, 1)
-        rows = {name: (slice(p.first, p.first + field[name].numel()), every) for name, p in places.items()}
+        rows = {name: (slice(p.first, p.first + tensors[name].numel()), every) for name, p in places.items()}
         moved = places[FREQUENCIES].first if FREQUENCIES in rows else None
         return [*blocks, Block("weights", shape, "mlp", rows, moved=moved)]
 
