@@ -216,9 +216,17 @@ def test_equal_things_that_meet_keep_their_own_trajectories() -> None:
     t = np.linspace(0, 1, 100)
     swing = 0.7 * np.cos(4 * np.pi * t)
     one, other = np.stack([swing, 0 * t, 0.23 + 0 * t], axis=1), np.stack([0 * t, swing, -0.23 + 0 * t], axis=1)
-    clouds = balls(one, other)
-    grey = tuple(cloud._replace(colors=0 * cloud.colors + 0.5) for cloud in clouds.clouds)
-    found = find_trajectories(PointClouds(clouds.times, grey), LINK, BOX)[0]
+    keep_their_own(one, other, t)
+
+
+def test_equal_things_keep_their_own_trajectories_through_gaps_between_the_images() -> None:
+    t = np.delete(np.linspace(0, 1, 120), [i for i in range(6, 114) if i % 17 < 6])
+    keep_their_own(*(each.positions(t) for each in moving_objects(MotionScene(path=2, cycles=1))[:2]), t)
+
+
+def keep_their_own(one: np.ndarray, other: np.ndarray, times: np.ndarray) -> None:
+    grey = tuple(cloud._replace(colors=0 * cloud.colors + 0.5) for cloud in balls(one, other).clouds)
+    found = find_trajectories(PointClouds(times, grey), LINK, BOX)[0]
     assert len(found) == 2
     for center in (one, other):
         assert min(np.linalg.norm(each.centers - center, axis=1).max() for each in found) < 1.5 * RADIUS
@@ -249,10 +257,13 @@ def test_patches_that_come_and_go_are_not_followed() -> None:
 # Turns ---------------------------------------------------------------------------------------------------------------
 
 
-def seen_turning(turns: float, size: int, count: int) -> tuple[Tracks, list[Residual], np.ndarray]:
+TIMES = np.linspace(0, 1, 40)
+
+
+def seen_turning(turns: float, times: np.ndarray, size: int = 48) -> tuple[Tracks, list[Residual], np.ndarray]:
     """Tracks of a box's center that do not know its turns, the images of it, and its rotations (T, 3, 3)."""
     scene = MotionScene(path=1, cycles=1, turns=turns)
-    box, times = moving_objects(scene)[1], np.linspace(0, 1, count)
+    box, count = moving_objects(scene)[1], len(times)
     black, images = np.zeros((size, size, 3), np.float32), []
     for camera, t in zip(scene_cameras(scene, "train", times, 0, size=size), times, strict=True):
         color, _ = combine([trace(scene, camera, float(t))[1]], 9 * size**2)
@@ -269,12 +280,11 @@ def seen_turning(turns: float, size: int, count: int) -> tuple[Tracks, list[Resi
 @pytest.mark.nightly
 def test_a_part_that_turns_becomes_a_rigid_body(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rigid_fit, "STEPS", 400)
-    tracks, images, true = seen_turning(0.8, 48, 40)
-    times = np.linspace(0, 1, 40)
-    stands, found = find_turns(tracks, times, images)
+    tracks, images, true = seen_turning(0.8, TIMES)
+    stands, found = find_turns(tracks, TIMES, images)
     assert degrees_beside(found[0], true).mean() < 15
     generator = torch.Generator().manual_seed(0)
-    rigid, light = rigid_fit.rigid_tracks(tracks, stands, found, times, images, device, generator)
+    rigid, light = rigid_fit.rigid_tracks(tracks, stands, found, TIMES, images, device, generator)
     assert light[0].mean(axis=0) == pytest.approx(np.ones(rigid_fit.POINTS), abs=1e-4)
     arms = rigid.paths - rigid.paths.mean(axis=1, keepdims=True)
     left, _, right = np.linalg.svd(np.einsum("tni,nj->tij", arms, arms[20]))
@@ -282,8 +292,15 @@ def test_a_part_that_turns_becomes_a_rigid_body(device: Device, monkeypatch: pyt
     assert np.ptp(np.linalg.norm(arms, axis=2), axis=0).max() < 1e-3  # it keeps its shape
 
 
+def test_what_turns_is_followed_through_gaps_between_the_images() -> None:
+    times = np.delete(np.linspace(0, 1, 60), [*range(14, 20), *range(36, 42)])
+    tracks, images, true = seen_turning(2.0, times)
+    _, found = find_turns(tracks, times, images)
+    assert degrees_beside(found[0], true).mean() < 6
+
+
 def test_one_of_the_parts_of_a_thing_stands_for_it_and_it_need_not_turn() -> None:
-    tracks, images, _ = seen_turning(0.0, 48, 40)
+    tracks, images, _ = seen_turning(0.0, TIMES)
     astray = tracks.paths + (np.arange(40) < 8)[:, None, None].astype(np.float32)
     both = Tracks(
         *(np.concatenate([each, each]) for each in tracks[:2]),
@@ -291,7 +308,7 @@ def test_one_of_the_parts_of_a_thing_stands_for_it_and_it_need_not_turn() -> Non
         np.concatenate([astray, tracks.paths], axis=1),
         np.concatenate([tracks.supported, tracks.supported], axis=1),
     )
-    stands, found = find_turns(both, np.linspace(0, 1, 40), images)
+    stands, found = find_turns(both, TIMES, images)
     assert stands.tolist() == [1, 1]
     assert not found
 

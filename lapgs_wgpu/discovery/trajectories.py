@@ -7,7 +7,7 @@ trajectories as a second opinion, since it goes astray where things are fast, hi
 
 Paths that were found one after another share groups, and change over where things meet. So as many paths as there
 usually are groups are given the groups of each time at once, one to one, and paths that meet part in the way in which
-they bend least.
+they bend least; so do all across a gap between the images, in which things may have gone anywhere.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ BEND = 0.3  # standard deviation of a group's center around the straight continu
 STEP = 0.7  # from one time to the next, at most
 REACHES = 0.5, 0.25, 0.12  # within twice this a path may be given a group, in rounds
 MEETING = 0.6  # paths that meet come so near
-MEET_TIMES, MEET_GAP = 6, 2  # time steps before and after a meeting that tell who is who; those around it that do not
+MEET_TIMES, MEET_GAP = 6, 2  # times before and after a meeting that tell who is who; those around it that do not
 
 
 class Trajectory(NamedTuple):
@@ -164,34 +164,35 @@ def _one_to_one(
 
 
 def _uncross(groups: _Groups, paths: list[list[int]], clock: NDArray[np.float64], half_side: float) -> None:
-    """Exchange the ends of two paths after they met, where both then bend less and keep their colors."""
+    """Exchange the ends of two paths behind a meeting or a gap, where both then bend less and keep their colors."""
     for a, b in combinations(range(len(paths)), 2):
         apart = np.linalg.norm(
             _smooth(groups, paths[a], clock).centers - _smooth(groups, paths[b], clock).centers, axis=1
         )
-        lowest = [
+        meetings = [
             i
             for i in range(1, len(clock) - 1)
-            if apart[i] < MEETING * half_side and apart[i] == apart[max(0, i - MEET_TIMES) : i + MEET_TIMES + 1].min()
+            if (apart[i] < MEETING * half_side and apart[i] == apart[max(0, i - MEET_TIMES) : i + MEET_TIMES + 1].min())
+            or clock[i + 1] - clock[i] > MEET_GAP
         ]
-        for i in lowest:
+        for i in meetings:
             before = [[g for g in paths[n] if groups.time[g] <= i] for n in (a, b)]
             after = [[g for g in paths[n] if groups.time[g] > i] for n in (a, b)]
             bends, changes = (
                 [sum(of(one, other) for one, other in zip(before, ends, strict=True)) for ends in (after, after[::-1])]
-                for of in (partial(_bend, groups, moment=clock[i]), partial(_change, groups))
+                for of in (partial(_bend, groups, clock, i), partial(_change, groups))
             )
             better = bends[1] < bends[0] and changes[1] < changes[0] + COLOR_SPREAD
             if better and min(len(before[0] + after[1]), len(before[1] + after[0])) >= LEAST_WORTH:
                 paths[a], paths[b] = before[0] + after[1], before[1] + after[0]
 
 
-def _bend(groups: _Groups, before: list[int], after: list[int], moment: float) -> float:
-    """Squared distances from a parabola of the groups of a path shortly before and after a moment."""
-    around = [g for g in before + after if MEET_GAP < abs(groups.clock[g] - moment) <= MEET_GAP + MEET_TIMES]
+def _bend(groups: _Groups, clock: NDArray[np.float64], at: int, before: list[int], after: list[int]) -> float:
+    """Squared distances from a parabola of the groups of a path at the times shortly before and after one."""
+    around = [g for g in before + after if MEET_GAP < abs(groups.time[g] - at) <= MEET_GAP + MEET_TIMES]
     if len(around) < 6:
         return 0.0
-    basis = np.vander((groups.clock[around] - moment) / MEET_TIMES, 3)
+    basis = np.vander((groups.clock[around] - clock[at]) / MEET_TIMES, 3)
     fitted = basis @ np.linalg.lstsq(basis, groups.centers[around], rcond=None)[0]
     return float(np.square(groups.centers[around] - fitted).sum())
 

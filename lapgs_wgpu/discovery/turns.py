@@ -1,8 +1,9 @@
 """Rotations of moving parts, estimated from their colors on a ball around each part's center.
 
-Where a part turns as assumed, images of different times agree on the color of each place of the ball. A search finds
-the turn from one time to the next on which those around a key time agree best. From there outwards, each time turns as
-its image fits best what is known of the ball, near the turn that goes on as before. `rigid_fit` makes it exact.
+The outline of what moves tells where the ball is. Where a part turns as assumed, images of different times agree on the
+color of each place of the ball. A search finds the turn per time step on which those around a key time agree best. From
+there outwards, each time turns as its image fits best what is known of the ball, near the turn that goes on as before;
+then each is fitted once more to what all others show. `rigid_fit` makes it exact.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from lapgs_wgpu.data.evenly import evenly_indices
+from lapgs_wgpu.data.timestamps import time_step
 from lapgs_wgpu.discovery.residual import Floats, Residual, cubic_grid
 from lapgs_wgpu.discovery.tracks import Tracks, parabolas
 
@@ -24,25 +26,31 @@ Doubles = NDArray[np.float64]
 PIXELS = 2000  # of an image, at most
 SAMPLES = 150  # of a part in an image, at most
 LEAST_SAMPLES = 10
+LEAST_TIMES = 12  # at which a part is seen
 ROUND = 0.9  # quantile of the distances of a part's points from its center that is the radius of the ball
 RIM = 0.9  # radii of the ball; beyond, pixels are mixed with what lies behind
 INSIDE = 0.75  # radii of the larger of two parts, within which the center of the other is of the same thing
-OVERLAP = 1.2  # radii of another part, within which pixels may show that one
+OVERLAP = 1.2  # radii of a part, within which pixels may show it
+OUTLINES = 2  # rounds in which balls are brought to the outlines of what moves
+UNSEEN = 1e-3  # weight of a time that shows no outline
+OUTLINE_SPREAD = 2.0  # time steps; of the weights by which these moves become smooth
 DARK = 0.2  # least light, of the mean brightness
 KEYS = 3  # times around which the turn is looked for
-REACH = 3, 5  # times on either side, in the rough search and in the finer ones
-FASTEST = 36.0  # degrees from one time to the next
-STEPS = 8.0, 4.0, 2.0  # degrees, of the rough search and the finer ones
-BEST = 12, 4  # turns of a search that the next one looks around
-CELL, FINE = 0.25, 0.12  # radii; size of the places at which colors are compared, in the search and from there on
+WINDOW = 12.0  # time steps on either side
+FASTEST = 36.0  # degrees a time step
+# The searches, from rough to fine: degrees between turns, time steps on either side over which images are compared,
+# and how many turns the next one looks around.
+SEARCHES = (8.0, 3, 12), (4.0, 5, 4), (2.0, 8, 2), (0.7, 12, 1)
+CELL, FINE = 0.18, 0.12  # radii; size of the places at which colors are compared, in the search and from there on
 BLUR = 2.0  # FINE; standard deviation of the weights by which the colors around a place tell its color
+KEPT = 8  # time steps from the key time, up to which its turn is kept
 AROUND = (6.0, 2), (2.0, 2), (1.0, 1)  # degrees of a step and number of steps, of the search for the turn of a time
 AS_BEFORE = 18.0  # degrees beside the turn that goes on as before, that weigh as much as all differences of color
 MEMORY = 4  # times by which a turn goes on
 SPREAD = 6.0  # time steps; of the weights by which turns become smooth
-# Share of the colors' variance that the turns of a part must explain, beyond what they do without turns: true ones 0.34
-# and more, others 0.18 at most.
-GAIN = 0.25
+# Share of the colors' variance that the turns of a part must explain, beyond what they do without turns: true ones 0.30
+# and more, others 0.13 at most.
+GAIN = 0.2
 
 
 class _Look(NamedTuple):
@@ -72,12 +80,17 @@ def find_turns(
     radii = np.array([part_radius(tracks, k) for k in range(len(centers))])
     stands = _one_of_each(centers, radii)
     things = np.unique(stands)
+    middles, sizes = np.stack([centers[k] for k in things], axis=1), radii[things]
+    for _ in range(OUTLINES):
+        middles, sizes = _outlined(times, middles, sizes, images)
+    clock, near = times / time_step(times), parabolas(times, np.ones(len(times)), SPREAD)
     found = {}
     for n, k in enumerate(things.tolist()):
-        looks = _looks(n, times, np.stack([centers[each] for each in things], axis=1), radii[things], images)
-        if sum(len(look.places) > 0 for look in looks) < 2 * max(REACH) + 1:
+        looks = _looks(n, times, middles, sizes, images)
+        if sum(len(look.places) > 0 for look in looks) < LEAST_TIMES:
             continue
-        R = _smoothed(_turns(looks), parabolas(times, np.ones(len(times)), SPREAD))
+        R = _smoothed(_turns(looks, clock), clock, near)
+        R = _smoothed(_fitted_again(looks, R), clock, near)
         colors = np.concatenate([look.colors for look in looks])
         turned, still = (
             _explained(np.concatenate([look.places @ each for look, each in zip(looks, S, strict=True)]), colors)
@@ -98,6 +111,35 @@ def _one_of_each(centers: Sequence[Floats], radii: Doubles) -> NDArray[np.int64]
             if stands[k] == k and stands[other] == other and bends[k] < bends[other]:
                 stands[other] = k if apart < INSIDE * max(radii[k], radii[other]) else other
     return stands
+
+
+def _outlined(times: Doubles, centers: Floats, radii: Doubles, images: Sequence[Residual]) -> tuple[Floats, Doubles]:
+    """Centers (T, p, 3) and radii (p,) of parts as the outlines of what moves tell, of those that stand alone and whole
+    in an image."""
+    shifts, seen = np.zeros(centers.shape), np.full(centers.shape[:2], UNSEEN)
+    sizes: list[list[float]] = [[] for _ in radii]
+    rows, columns = np.indices(images[0].mask.shape) + 0.5
+    for image in images:
+        at, K, T = int(np.searchsorted(times, image.time)), image.camera.K, image.camera.T_cam_world
+        middles, depths = image.camera.project(centers[at].astype(np.float64))
+        reach = OVERLAP * K[0, 0] * radii / np.maximum(depths, 1e-6)
+        apart = np.hypot(*(middles - middles[:, None]).T) > reach + reach[:, None]
+        alone = (apart | np.eye(len(radii), dtype=bool)).all(axis=0)
+        whole = ((middles > reach[:, None]) & (middles < np.array(rows.shape)[::-1] - reach[:, None])).all(axis=1)
+        for n in np.flatnonzero(alone & whole & (depths > 0)):
+            x, y = middles[n]
+            own = image.mask & (np.hypot(columns - x, rows - y) < reach[n])
+            if own.sum() < LEAST_SAMPLES:
+                continue
+            away = np.array([(columns[own].mean() - x) / K[0, 0], (rows[own].mean() - y) / K[1, 1], 0.0])
+            shifts[at, n], seen[at, n] = depths[n] * away @ T[:3, :3], 1.0
+            sizes[n].append(float(np.sqrt(own.sum() / np.pi) * depths[n] / K[0, 0]))
+    moved, found = centers.copy(), radii.copy()
+    for n, each in enumerate(sizes):
+        if len(each) >= LEAST_TIMES:
+            moved[:, n] += parabolas(times, seen[:, n], OUTLINE_SPREAD) @ shifts[:, n]
+            found[n] = np.median(each)
+    return moved, found
 
 
 def _looks(k: int, times: Doubles, centers: Floats, radii: Doubles, images: Sequence[Residual]) -> list[_Look]:
@@ -140,11 +182,13 @@ def _cells(places: Doubles, size: float) -> tuple[NDArray[np.int64], int]:
     return (index[..., 0] * side + index[..., 1]) * side + index[..., 2], side
 
 
-def _explained(places: Doubles, colors: Floats) -> float:
-    """Share of the variance of colors (n, 3) that places (n, 3) of size CELL explain, as if they were independent."""
+def _explained(places: Doubles, colors: Floats, blocks: NDArray[np.int64] | int = 0) -> float:
+    """Share of the variance of colors (n, 3) that places (n, 3) of size CELL explain, as if they were independent.
+    blocks: (n,) from 0; only places of one block are compared."""
     if len(colors) < 2:
         return 0.0
-    cells, _ = _cells(places, CELL)
+    cells, side = _cells(places, CELL)
+    cells += blocks * side**3
     counts = np.bincount(cells)
     used = np.flatnonzero(counts)
     rest = float(np.square(colors).sum())
@@ -153,27 +197,31 @@ def _explained(places: Doubles, colors: Floats) -> float:
     return 1.0 - rest / max(len(cells) - len(used), 1) / max(float(colors.var(axis=0).sum()), 1e-9)
 
 
-def _turn_at(looks: list[_Look], key: int) -> tuple[Doubles, float]:
-    """The turn (3,) from one time to the next around a key time, a rotation vector, and how much more of the colors it
-    explains than no turn."""
+def _turn_at(looks: list[_Look], clock: Doubles, key: int) -> tuple[Doubles, float]:
+    """The turn (3,) a time step around a key time, a rotation vector, and how much more of the colors it explains than
+    no turn. clock: (T,) time steps."""
+    window = [i for i in np.flatnonzero(np.abs(clock - clock[key]) <= WINDOW) if len(looks[i].places)]
+    lapses = clock[window] - clock[key]
+    places, colors = (np.concatenate([looks[i][n] for i in window]) for n in (0, 1))
+    of = np.repeat(np.arange(len(window)), [len(looks[i].places) for i in window])
 
     def explained(turns: Doubles, reach: int) -> Doubles:
-        around = range(max(0, key - reach), min(len(looks), key + reach + 1))
-        colors = np.concatenate([looks[i].colors for i in around])
-        rotations = [(looks[i].places, Rotation.from_rotvec((i - key) * turns).as_matrix()) for i in around]
-        return np.array(
-            [_explained(np.concatenate([places @ R[n] for places, R in rotations]), colors) for n in range(len(turns))]
-        )
+        blocks = np.round(lapses / (2 * reach + 1)).astype(np.int64)
+        within = lapses - blocks * (2 * reach + 1)
+        values = []
+        for turn in turns:
+            R = Rotation.from_rotvec(within[:, None] * turn).as_matrix()
+            values.append(_explained(np.einsum("ni,nij->nj", places, R[of]), colors, (blocks - blocks.min())[of]))
+        return np.array(values)
 
-    turns = STEPS[0] * _grid(int(FASTEST / STEPS[0]))
+    turns = SEARCHES[0][0] * _grid(int(FASTEST / SEARCHES[0][0]))
     turns = np.radians(turns[np.linalg.norm(turns, axis=1) <= FASTEST])
-    values = explained(turns, REACH[0])
-    for step, best in zip(STEPS[1:], BEST, strict=True):
-        around = turns[np.argsort(-values, kind="stable")[:best], None] + np.radians(step) * _grid(1)
-        turns = np.unique(around.reshape(-1, 3).round(9), axis=0)
-        values = explained(turns, REACH[1])
-    top = int(values.argmax())
-    return turns[top], float(values[top] - explained(np.zeros((1, 3)), REACH[1])[0])
+    for step, reach, best in SEARCHES:
+        if step < SEARCHES[0][0]:
+            turns = np.unique((turns[:, None] + np.radians(step) * _grid(1)).reshape(-1, 3).round(9), axis=0)
+        values = explained(turns, reach)
+        turns = turns[np.argsort(-values, kind="stable")[:best]]
+    return turns[0], float(values.max() - explained(np.zeros((1, 3)), reach)[0])
 
 
 def _grid(half: int) -> Doubles:
@@ -181,29 +229,49 @@ def _grid(half: int) -> Doubles:
     return cubic_grid(np.arange(-half, half + 1.0))
 
 
-def _turns(looks: list[_Look]) -> Doubles:
-    """(T, 3, 3) rotations of a part, from the key time at which a turn explains most."""
-    reach, count = REACH[1], len(looks)
-    keys = np.unique(np.linspace(reach, count - 1 - reach, KEYS).round().astype(int))
-    found = [_turn_at(looks, int(key)) for key in keys]
+def _turns(looks: list[_Look], clock: Doubles) -> Doubles:
+    """(T, 3, 3) rotations of a part, from the key time at which a turn explains most. clock: (T,) time steps."""
+    seen = np.flatnonzero([len(look.places) for look in looks])
+    keys = np.unique(seen[np.linspace(0, len(seen) - 1, KEYS + 2).round().astype(int)[1:-1]])
+    found = [_turn_at(looks, clock, int(key)) for key in keys]
     best = int(np.argmax([gain for _, gain in found]))
     key, turn = int(keys[best]), found[best][0]
-    R = Rotation.from_rotvec((np.arange(count) - key)[:, None] * turn).as_matrix()
-    sums = np.zeros((4, *[_cells(np.zeros(3), FINE)[1]] * 3))  # of the cells: number of samples, and their colors
-    for i in sorted(range(count), key=lambda i: (abs(i - key), i)):
-        if abs(i - key) > reach:
-            last = i - np.sign(i - key) * np.arange(1, MEMORY + 2)
+    lapses = clock - clock[key]
+    R = Rotation.from_rotvec(lapses[:, None] * turn).as_matrix()
+    known = _known(looks[:0], R[:0])
+    for i in sorted(range(len(looks)), key=lambda i: (abs(i - key), i)):
+        last = i - np.sign(i - key) * np.arange(1, MEMORY + 2)
+        if abs(lapses[i]) > KEPT and 0 <= last[-1] < len(looks):
             steps = Rotation.from_matrix(R[last[:-1]] @ np.swapaxes(R[last[1:]], 1, 2)).as_rotvec()
-            R[i] = _turn_of(looks[i], Rotation.from_rotvec(steps.mean(axis=0)).as_matrix() @ R[last[0]], sums)
-        cells, _ = _cells(looks[i].places @ R[i], FINE)
-        for each, values in zip(sums, [None, *looks[i].colors.T], strict=True):
-            each += np.bincount(cells, values, each.size).reshape(each.shape)
+            turn = (steps / (clock[last[:-1]] - clock[last[1:]])[:, None]).mean(axis=0)
+            onward = Rotation.from_rotvec((clock[i] - clock[last[0]]) * turn).as_matrix()
+            R[i] = _turn_of(looks[i], onward @ R[last[0]], known)
+        known += _known([looks[i]], R[i : i + 1])
     return R
 
 
+def _fitted_again(looks: list[_Look], R: Doubles) -> Doubles:
+    """Rotations (T, 3, 3), near the given ones, of which each fits best what all other times show."""
+    known = _known(looks, R)
+    return np.stack(
+        [_turn_of(look, each, known - _known([look], each[None])) for look, each in zip(looks, R, strict=True)]
+    )
+
+
+def _known(looks: list[_Look], R: Doubles) -> Doubles:
+    """(4, n, n, n) what times of rotations R (T, 3, 3) show of a ball's places of size FINE: number of samples, and
+    sums of their colors."""
+    sums = np.zeros((4, *[_cells(np.zeros(3), FINE)[1]] * 3))
+    for look, turn in zip(looks, R, strict=True):
+        cells, _ = _cells(look.places @ turn, FINE)
+        for each, values in zip(sums, [None, *look.colors.T], strict=True):
+            each += np.bincount(cells, values, each.size).reshape(each.shape)
+    return sums
+
+
 def _turn_of(look: _Look, expected: Doubles, sums: Doubles) -> Doubles:
-    """The rotation (3, 3) near the expected one by which a time fits best what earlier ones show."""
-    if not len(look.places):
+    """The rotation (3, 3) near the expected one by which a time fits best what others show, as `_known` gives it."""
+    if not len(look.places) or not sums[0].any():
         return expected
     total, mean = sums[0].sum(), sums[1:].sum(axis=(1, 2, 3)) / sums[0].sum()
     count, *blurred = (gaussian_filter(each, BLUR, mode="constant", truncate=2.5).ravel() for each in sums)
@@ -220,14 +288,14 @@ def _turn_of(look: _Look, expected: Doubles, sums: Doubles) -> Doubles:
     return best
 
 
-def _smoothed(R: Doubles, near: NDArray[np.floating]) -> Doubles:
+def _smoothed(R: Doubles, clock: Doubles, near: NDArray[np.floating]) -> Doubles:
     """Rotations (T, 3, 3) of which each is the mean of those around, by weights (T, T), as they go on from it."""
-    steps = Rotation.from_matrix(R[1:] @ np.swapaxes(R[:-1], 1, 2)).as_rotvec()
+    steps = Rotation.from_matrix(R[1:] @ np.swapaxes(R[:-1], 1, 2)).as_rotvec() / np.diff(clock)[:, None]
     smooth = np.empty_like(R)
     for i, weights in enumerate(near):
         around = np.flatnonzero(np.abs(weights) > 1e-3)
         speed = np.median(steps[around[0] : around[-1]], axis=0)  # what is left beside it is far from half a turn
-        ahead = Rotation.from_rotvec((around - i)[:, None] * speed).as_matrix()
+        ahead = Rotation.from_rotvec((clock[around] - clock[i])[:, None] * speed).as_matrix()
         beside = Rotation.from_matrix(np.swapaxes(ahead, 1, 2) @ R[around] @ R[i].T).as_rotvec()
         smooth[i] = Rotation.from_rotvec(weights[around] @ beside).as_matrix() @ R[i]
     return smooth
