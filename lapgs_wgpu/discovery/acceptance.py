@@ -26,7 +26,7 @@ SCALE = 0.4  # of it, in mean distances to its nearest neighbours; more of them 
 SHEET_SCALE, SHEET_OPACITY = 1.2, 0.9  # the same of parts that are sheets
 IMAGES = 60  # by which a part is judged, at most
 CHANGED = 2.0 / 255  # of a pixel's channel, from which on a part shows there
-MOVING = 0.53  # share of the pixels in which a part shows that move, at least
+MOVING = 0.5  # share of the pixels in which a part shows that move, at least
 GAIN = 0.05  # or share of the static fit's error there that it takes away: where several images show each time
 NEAR = 0.1  # box half sides; distance within which a track explains a surface point
 
