@@ -48,6 +48,7 @@ ENTER_HEIGHT, ENTER_TIMES = 2.3, (0.3, 0.5)  # the box drops into the scene from
 TILT = 0.6  # radians; of the axis of what turns
 RODS = 1 / 4, 1 / 8  # thickness of the rods, diameters
 SHORTEST_OCCLUDED_PATH = 3  # leaves space for a column
+GAP = 6  # times
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,7 @@ class MotionScene(Options):
         "two",
     )
     turns: float = option("of both objects about a tilted axis over the clip", 0.0, at_least=0, at_most=60)
+    gaps: int = option(f"blocks of {GAP} training times that have no image", 0, at_least=0, at_most=9)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 from dnerf_writer import split_times, write_image, write_scene
-from motion_scenes import STILL_CAMERAS, MotionScene, fov_x, moving_objects, scene_cameras, trace
+from motion_scenes import GAP, STILL_CAMERAS, MotionScene, fov_x, moving_objects, scene_cameras, trace
 from numpy.typing import NDArray
 from raytrace import SAMPLES, Hits, combine, pixel_means, to_bytes, to_pixels
 
@@ -46,7 +46,8 @@ def write_motion(
     test_views: int = 20,
     seed: int = 0,
 ) -> Path:
-    """Write a scene: training images at equally spaced times, test and validation images halfway between them.
+    """Write a scene: training images at equally spaced times without those in gaps, test and validation images halfway
+    between two of all.
 
     Equal arguments give equal bytes. A folder that already holds the scene is not changed.
 
@@ -84,6 +85,9 @@ def write_motion(
     train, test = split_times(train_times, test_views)
     times_of = {"train": np.repeat(train, STILL_CAMERAS) if still else train, "val": test, "test": test}
     splits = {split: (scene_cameras(scene, split, times, seed, size=size), times) for split, times in times_of.items()}
+    shown = np.isin(times_of["train"], np.delete(train, _gaps(train_times, scene.gaps)))
+    times_of["train"] = times_of["train"][shown]
+    splits["train"] = [splits["train"][0][i] for i in np.flatnonzero(shown)], times_of["train"]
     objects = [
         {
             "name": one.name,
@@ -100,6 +104,11 @@ def write_motion(
     return write_scene(
         Path(folder), "objects.json", parameters, splits, fov_x(scene), write_frame, {"objects": objects}
     )
+
+
+def _gaps(times: int, gaps: int) -> list[int]:
+    """The training times without an image, in blocks that are spread over the clip."""
+    return [k * (times // (gaps + 1)) + i for k in range(1, gaps + 1) for i in range(GAP)]
 
 
 def _write_frame(scene: MotionScene, folder: Path, split: str, name: str, camera: Camera, time: float) -> None:
