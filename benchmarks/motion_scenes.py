@@ -73,11 +73,12 @@ class MotionScene(Options):
         "two",
     )
     turns: float = option("of both objects about a tilted axis over the clip", 0.0, at_least=0, at_most=60)
+    twists: float = option("how often they turn so far to and fro instead", 0.0, at_least=0, at_most=20)
     gaps: int = option(f"blocks of {GAP} training times that have no image", 0, at_least=0, at_most=9)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("path", "cycles", "turns"):
+        for name in ("path", "cycles", "turns", "twists"):
             object.__setattr__(self, name, float(getattr(self, name)))  # 4 and 4.0 are written alike
         if self.objects == "occluded" and self.path < SHORTEST_OCCLUDED_PATH:
             raise ValueError(
@@ -91,7 +92,8 @@ class MovingObject:
     """A solid with center `centre + cosine cos(2 pi f t) + sine sin(2 pi f t)`, f = `cycles`, world units.
 
     diameter: of the ball, or of a ball with the volume of the box. drop: height from which it enters. A static object
-    has 0 cycles; no masks are written for it. turns: over the clip, about an axis of its own.
+    has 0 cycles; no masks are written for it. turns: over the clip, about an axis of its own, or to each
+    side and back, twists times.
     """
 
     name: str
@@ -103,6 +105,7 @@ class MovingObject:
     cycles: float = 0.0
     drop: float = 0.0
     turns: float = 0.0
+    twists: float = 0.0
 
     @property
     def moves(self) -> bool:
@@ -127,7 +130,8 @@ class MovingObject:
         if not self.turns:
             return np.eye(3)
         c, s = math.cos(TILT), math.sin(TILT)
-        return np.array([[1, 0, 0], [0, c, -s], [0, s, c]]) @ turn_about_z(2 * math.pi * self.turns * time)
+        share = math.sin(2 * math.pi * self.twists * time) if self.twists else time
+        return np.array([[1, 0, 0], [0, c, -s], [0, s, c]]) @ turn_about_z(2 * math.pi * self.turns * share)
 
 
 def moving_objects(scene: MotionScene) -> tuple[MovingObject, ...]:
@@ -146,6 +150,7 @@ def moving_objects(scene: MotionScene) -> tuple[MovingObject, ...]:
         sine=(-radius * math.sin(0.6), radius * math.cos(0.6), 0),
         cycles=scene.cycles,
         turns=scene.turns,
+        twists=scene.twists,
     )
     occluded = scene.objects == "occluded"
     box = MovingObject(
@@ -158,6 +163,7 @@ def moving_objects(scene: MotionScene) -> tuple[MovingObject, ...]:
         cycles=scene.cycles,
         drop=ENTER_HEIGHT if scene.objects == "enter" else 0.0,
         turns=scene.turns,
+        twists=scene.twists,
     )
     still = MovingObject(
         "still",

@@ -96,6 +96,7 @@ def write_motion(
             "half": one.solid.half,
             "diameter": one.diameter,
             "turns": one.turns,
+            "twists": one.twists,
             "positions": {split: one.positions(times).tolist() for split, times in times_of.items()},
         }
         for one in moving_objects(scene)

@@ -260,9 +260,9 @@ def test_patches_that_come_and_go_are_not_followed() -> None:
 TIMES = np.linspace(0, 1, 40)
 
 
-def seen_turning(turns: float, times: np.ndarray, size: int = 48) -> tuple[Tracks, list[Residual], np.ndarray]:
+def seen_turning(turns: float, times: np.ndarray, twists: int = 0) -> tuple[Tracks, list[Residual], np.ndarray]:
     """Tracks of a box's center that do not know its turns, the images of it, and its rotations (T, 3, 3)."""
-    scene = MotionScene(path=1, cycles=1, turns=turns)
+    scene, size = MotionScene(path=1, cycles=1, turns=turns, twists=twists), 48
     box, count = moving_objects(scene)[1], len(times)
     black, images = np.zeros((size, size, 3), np.float32), []
     for camera, t in zip(scene_cameras(scene, "train", times, 0, size=size), times, strict=True):
@@ -292,9 +292,10 @@ def test_a_part_that_turns_becomes_a_rigid_body(device: Device, monkeypatch: pyt
     assert np.ptp(np.linalg.norm(arms, axis=2), axis=0).max() < 1e-3  # it keeps its shape
 
 
-def test_what_turns_is_followed_through_gaps_between_the_images() -> None:
-    times = np.delete(np.linspace(0, 1, 60), [*range(14, 20), *range(36, 42)])
-    tracks, images, true = seen_turning(2.0, times)
+@pytest.mark.parametrize(("turns", "twists", "gaps"), [(2.0, 0, (24, 66)), (1 / 6, 2, ())])
+def test_what_turns_through_gaps_or_to_and_fro_is_followed(turns: float, twists: int, gaps: tuple[int, ...]) -> None:
+    times = np.delete(np.linspace(0, 1, 100), [i for gap in gaps for i in range(gap, gap + 6)])
+    tracks, images, true = seen_turning(turns, times, twists)
     _, found = find_turns(tracks, times, images)
     assert degrees_beside(found[0], true).mean() < 6
 

@@ -36,21 +36,21 @@ UNSEEN = 1e-3  # weight of a time that shows no outline
 OUTLINE_SPREAD = 2.0  # time steps; of the weights by which these moves become smooth
 DARK = 0.2  # least light, of the mean brightness
 KEYS = 3  # times around which the turn is looked for
-WINDOW = 12.0  # time steps on either side
+WINDOW = 8.0  # time steps on either side
 FASTEST = 36.0  # degrees a time step
 # The searches, from rough to fine: degrees between turns, time steps on either side over which images are compared,
 # and how many turns the next one looks around.
-SEARCHES = (8.0, 3, 12), (4.0, 5, 4), (2.0, 8, 2), (0.7, 12, 1)
+SEARCHES = (8.0, 3, 12), (4.0, 5, 4), (2.0, 8, 1)
 CELL, FINE = 0.18, 0.12  # radii; size of the places at which colors are compared, in the search and from there on
-BLUR = 2.0  # FINE; standard deviation of the weights by which the colors around a place tell its color
-KEPT = 8  # time steps from the key time, up to which its turn is kept
+BLUR = 1.0  # FINE; standard deviation of the weights by which the colors around a place tell its color
+KEPT = 5  # time steps from the key time, up to which its turn is kept
 AROUND = (6.0, 2), (2.0, 2), (1.0, 1)  # degrees of a step and number of steps, of the search for the turn of a time
-AS_BEFORE = 18.0  # degrees beside the turn that goes on as before, that weigh as much as all differences of color
+AS_BEFORE = 36.0  # degrees beside the turn that goes on as before, that weigh as much as all differences of color
 MEMORY = 4  # times by which a turn goes on
 SPREAD = 6.0  # time steps; of the weights by which turns become smooth
-# Share of the colors' variance that the turns of a part must explain, beyond what they do without turns: true ones 0.30
-# and more, others 0.13 at most.
-GAIN = 0.2
+# Share of the colors' variance that is left without turns, which the turns of a part must explain: true ones 0.28 and
+# more, others 0.17 at most.
+GAIN = 0.22
 
 
 class _Look(NamedTuple):
@@ -96,7 +96,7 @@ def find_turns(
             _explained(np.concatenate([look.places @ each for look, each in zip(looks, S, strict=True)]), colors)
             for S in (R, [np.eye(3)] * len(R))
         )
-        if turned - still >= GAIN:
+        if turned - still >= GAIN * (1.0 - still):
             found[k] = R
     return stands, found
 
