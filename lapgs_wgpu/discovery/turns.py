@@ -115,17 +115,17 @@ def _one_of_each(centers: Sequence[Floats], radii: Doubles) -> NDArray[np.int64]
 
 def _outlined(times: Doubles, centers: Floats, radii: Doubles, images: Sequence[Residual]) -> tuple[Floats, Doubles]:
     """Centers (T, p, 3) and radii (p,) of parts as the outlines of what moves tell, of those that stand alone and whole
-    in an image."""
+    in an image. Where several images show a time, the last one tells."""
     shifts, seen = np.zeros(centers.shape), np.full(centers.shape[:2], UNSEEN)
     sizes: list[list[float]] = [[] for _ in radii]
-    rows, columns = np.indices(images[0].mask.shape) + 0.5
     for image in images:
+        rows, columns = np.indices(image.mask.shape) + 0.5
         at, K, T = int(np.searchsorted(times, image.time)), image.camera.K, image.camera.T_cam_world
         middles, depths = image.camera.project(centers[at].astype(np.float64))
         reach = OVERLAP * K[0, 0] * radii / np.maximum(depths, 1e-6)
         apart = np.hypot(*(middles - middles[:, None]).T) > reach + reach[:, None]
         alone = (apart | np.eye(len(radii), dtype=bool)).all(axis=0)
-        whole = ((middles > reach[:, None]) & (middles < np.array(rows.shape)[::-1] - reach[:, None])).all(axis=1)
+        whole = ((middles > reach[:, None]) & (middles < np.array(image.mask.shape)[::-1] - reach[:, None])).all(axis=1)
         for n in np.flatnonzero(alone & whole & (depths > 0)):
             x, y = middles[n]
             own = image.mask & (np.hypot(columns - x, rows - y) < reach[n])
