@@ -126,7 +126,7 @@ def _outlined(times: Doubles, centers: Floats, radii: Doubles, images: Sequence[
         apart = np.hypot(*(middles - middles[:, None]).T) > reach + reach[:, None]
         alone = (apart | np.eye(len(radii), dtype=bool)).all(axis=0)
         whole = ((middles > reach[:, None]) & (middles < np.array(image.mask.shape)[::-1] - reach[:, None])).all(axis=1)
-        for n in np.flatnonzero(alone & whole & (depths > 0)):
+        for n in np.flatnonzero(alone & whole & (depths > 0)).tolist():
             x, y = middles[n]
             own = image.mask & (np.hypot(columns - x, rows - y) < reach[n])
             if own.sum() < LEAST_SAMPLES:
