@@ -88,6 +88,11 @@ class Residual:
         pixel = np.where(inside, row * width + column, 0).astype(np.int64)
         return Samples(self._soft.ravel()[pixel] * inside, self._blurred.reshape(-1, 3)[pixel], inside)
 
+    def moving_within(self, middle: NDArray[np.float64], radius: float) -> Mask:
+        """(H, W), the moving pixels in a disc, both in pixels."""
+        rows, columns = np.indices(self.mask.shape) + 0.5
+        return self.mask & (np.hypot(columns - middle[0], rows - middle[1]) < radius)
+
     def rays(self, most: int) -> Rays:
         """Rays of at most `most` moving pixels, evenly chosen."""
         rows, columns = np.nonzero(self.mask)

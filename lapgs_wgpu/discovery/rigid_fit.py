@@ -137,8 +137,7 @@ def _with_bodies(tracks: Tracks, stands: NDArray[np.int64], bodies: Mapping[int,
 def _shown(image: Residual, centers: Floats, radii: Floats) -> list[NDArray[np.bool_]]:
     """For each ball (n, 3) of these radii (n,) the moving pixels (H, W) within its outline."""
     middles, depths = image.camera.project(centers.astype(np.float64))
-    rows, columns = np.indices(image.mask.shape) + 0.5
     return [
-        image.mask & (np.hypot(columns - x, rows - y) < image.camera.K[0, 0] * radius / depth)
-        for (x, y), depth, radius in zip(middles, np.maximum(depths, 1e-6), radii, strict=True)
+        image.moving_within(middle, image.camera.K[0, 0] * radius / depth)
+        for middle, depth, radius in zip(middles, np.maximum(depths, 1e-6), radii, strict=True)
     ]

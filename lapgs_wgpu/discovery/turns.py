@@ -119,7 +119,6 @@ def _outlined(times: Doubles, centers: Floats, radii: Doubles, images: Sequence[
     shifts, seen = np.zeros(centers.shape), np.full(centers.shape[:2], UNSEEN)
     sizes: list[list[float]] = [[] for _ in radii]
     for image in images:
-        rows, columns = np.indices(image.mask.shape) + 0.5
         at, K, T = int(np.searchsorted(times, image.time)), image.camera.K, image.camera.T_cam_world
         middles, depths = image.camera.project(centers[at].astype(np.float64))
         reach = OVERLAP * K[0, 0] * radii / np.maximum(depths, 1e-6)
@@ -127,13 +126,13 @@ def _outlined(times: Doubles, centers: Floats, radii: Doubles, images: Sequence[
         alone = (apart | np.eye(len(radii), dtype=bool)).all(axis=0)
         whole = ((middles > reach[:, None]) & (middles < np.array(image.mask.shape)[::-1] - reach[:, None])).all(axis=1)
         for n in np.flatnonzero(alone & whole & (depths > 0)).tolist():
-            x, y = middles[n]
-            own = image.mask & (np.hypot(columns - x, rows - y) < reach[n])
-            if own.sum() < LEAST_SAMPLES:
+            rows, columns = np.nonzero(image.moving_within(middles[n], reach[n]))
+            if len(rows) < LEAST_SAMPLES:
                 continue
-            away = np.array([(columns[own].mean() - x) / K[0, 0], (rows[own].mean() - y) / K[1, 1], 0.0])
+            x, y = (np.array([columns, rows]) + 0.5).mean(axis=1) - middles[n]
+            away = np.array([x / K[0, 0], y / K[1, 1], 0.0])
             shifts[at, n], seen[at, n] = depths[n] * away @ T[:3, :3], 1.0
-            sizes[n].append(float(np.sqrt(own.sum() / np.pi) * depths[n] / K[0, 0]))
+            sizes[n].append(float(np.sqrt(len(rows) / np.pi) * depths[n] / K[0, 0]))
     moved, found = centers.copy(), radii.copy()
     for n, each in enumerate(sizes):
         if len(each) >= LEAST_TIMES:
