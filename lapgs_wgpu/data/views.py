@@ -22,6 +22,8 @@ from lapgs_wgpu.data.timestamps import time_step
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
+AROUND = 6  # cameras that tell what moves between them
+ONE_SIDED = 0.8  # length of the mean direction to the cameras, from which on they stand on one side
 GOLDEN_SECTION = (5**0.5 - 1) / 2
 
 
@@ -132,6 +134,15 @@ class Dataset:
     def is_rig(self) -> bool:
         """Whether several cameras stand still: each keeps its own colors."""
         return len(self.cameras) > 1 and self.still_cameras
+
+    @cached_property
+    def is_surrounded(self) -> bool:
+        """Whether still cameras stand all around what they look at, AROUND of them or more at each time."""
+        if not self.is_rig or len(self.train) < AROUND * len(self.times):
+            return False
+        rays = np.stack([camera.position - self.focus for camera in self.cameras])
+        rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
+        return bool(np.linalg.norm(rays.mean(axis=0)) < ONE_SIDED)
 
     @cached_property
     def moments(self) -> int:

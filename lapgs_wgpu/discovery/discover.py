@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from lapgs_wgpu.data.views import Dataset
@@ -18,19 +22,22 @@ from lapgs_wgpu.discovery.static_fit import static_fit
 from lapgs_wgpu.discovery.surface_points import surface_points
 from lapgs_wgpu.discovery.tracks import Tracks, find_tracks
 from lapgs_wgpu.discovery.turns import find_turns
+from lapgs_wgpu.discovery.visual_hull import hull_points
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.morton import morton_order
+from lapgs_wgpu.train.camera_refinement import Corrections
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config
-from lapgs_wgpu.train.start import Start
+from lapgs_wgpu.train.start import Start, start_from_points
 
 DYNAMICS = 0.5  # standard deviation of the dynamics attribute of a discovered Gaussian, which it shares with its part
 SHEET_DYNAMICS = 2.0  # in place of it: of all sheets, and of the last one's time
 NEARLY_ALL = 0.8  # share of the surface points that tracks explain, above which the field has little left to learn
 ALL_TURN = 0.1  # of the field's highest rates, where all that moves turns: it forgets turns sooner than places
 RAMP_STEPS = 200  # over which learning rates rise after discovery, where schedule.warm_up is 0
+STATIC_FIT = "a static fit"
 SHOWN = 2.0 / 255  # least difference from the background of an image that shows something
 
 
@@ -54,7 +61,74 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
         InputError: the images show nothing at all.
     """
     started = time.perf_counter()
-    steps, fit_steps = config.discovery.steps, config.discovery.field_steps
+    generator = torch.Generator().manual_seed(config.seed)
+    found = _in_hull(config, dataset, device) if dataset.is_surrounded else None
+    found = found or _in_residuals(config, dataset, device, generator)
+    static, tracks, share, sheets, light = found.static, found.tracks, found.share, found.sheets, found.light
+    if share < config.discovery.least:
+        tracks = None
+    scene = scene_with(static, tracks, config, device, generator, own_field, sheets=sheets)
+    summary = f"{share:.1%} of what it lacks can be followed: nothing is added"
+    if tracks is not None:
+        steps = config.discovery.field_steps
+        meter = Progress(steps, "steps of motion discovery, part 2 of 2: what moves")
+        still = len(static)
+        error = fit_field(scene, tracks, found.times, still, steps, generator, meter.at, fades=sheets, light=light)
+        meter.clear()
+        if error is None:
+            tracks, scene = None, scene_with(static, None, config, device, generator, own_field)
+            summary = f"{share:.1%} of what it lacks can be followed, and the field moves nothing: nothing is added"
+    if tracks is not None:
+        summary = (
+            f"{len(np.unique(tracks.part))} moving parts with {len(tracks.part)} Gaussians, {share:.0%} of what it "
+            f"lacks, followed within {error:.3f} world units"
+        )
+        if light:
+            summary += f", {len(light)} of them as rigid bodies"
+    order = morton_order(scene.parameters["means"].detach())
+    for name, values in scene.parameters.items():
+        scene.parameters[name] = torch.nn.Parameter(values.detach()[order])
+    field_fitted = 0.0
+    if tracks is not None and share >= NEARLY_ALL:
+        field_fitted = ALL_TURN if len(light) == len(np.unique(tracks.part)) else 1.0
+    return Start(
+        scene,
+        ramp_steps=config.schedule.warm_up or RAMP_STEPS,
+        field_fitted=field_fitted,
+        corrections=found.corrections,
+        summary=f"{found.origin} of {len(static)} Gaussians; {summary}",
+        seconds=time.perf_counter() - started,
+    )
+
+
+class _Found(NamedTuple):
+    """static: what stands still. tracks: of what moves, over the times (T,). share: of the points of what moves, those
+    that tracks explain. origin: of what stands still, in words. sheets: whether each part is a sheet. light: on rigid
+    bodies. corrections: of cameras."""
+
+    static: Scene4D
+    tracks: Tracks | None
+    times: NDArray[np.float64]
+    share: float
+    origin: str
+    sheets: bool = False
+    light: Mapping[int, Floats] = MappingProxyType({})
+    corrections: Corrections | None = None
+
+
+def _in_hull(config: Config, dataset: Dataset, device: Device) -> _Found | None:
+    """What moves between cameras all around, before initial points; None where nothing can be followed."""
+    clouds = hull_points(dataset, config.points.box)
+    tracks = find_tracks(clouds, config.points.box)
+    if tracks is None:
+        return None
+    share = explained_share(clouds, tracks, config.points.box)
+    return _Found(start_from_points(config, dataset, device).scene, tracks, clouds.times, share, "a start")
+
+
+def _in_residuals(config: Config, dataset: Dataset, device: Device, generator: torch.Generator) -> _Found:
+    """What moves where the training images differ from a static fit. Raises InputError where they show nothing."""
+    half_side, steps = config.points.box, config.discovery.steps
     meter = Progress(steps, "steps of motion discovery, part 1 of 2: what stands still")
     static, images, depths, corrections = static_fit(config, dataset, device, meter.at)
     meter.at(steps, lambda: "motion discovery: following what moves from one time to the next")
@@ -64,57 +138,24 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
             f"{dataset.train[0].source} and the other {len(dataset.train) - 1} training images show nothing but the "
             f"{config.data.background} background; check the images and data.background."
         )
-    half_side = config.points.box
-    sheets = depths is not None and not dataset.is_rig
-    if sheets and depths is not None:
+    if depths is not None and not dataset.is_rig:
         times = np.array([image.time for image in images])
         tracks, share = cutout_tracks(images, depths, half_side)
-    else:
-        clouds = surface_points(images, half_side)
-        times, tracks = clouds.times, find_tracks(clouds, half_side)
-        if tracks is not None:
-            together = 2 * len(dataset.times) <= len(dataset.train)
-            tracks = tracks_in_images(tracks, times, images, static, background, together=together)
-        share = 0.0 if tracks is None else explained_share(clouds, tracks, half_side)
-    if share < config.discovery.least:
-        tracks = None
-    generator = torch.Generator().manual_seed(config.seed)
-    light: dict[int, Floats] = {}  # on rigid bodies
-    if tracks is not None and not sheets:
-        stands, turns = find_turns(tracks, times, images)
+        meter.clear()
+        return _Found(static, tracks, times, share, STATIC_FIT, sheets=True, corrections=corrections)
+    clouds = surface_points(images, half_side)
+    tracks = find_tracks(clouds, half_side)
+    if tracks is not None:
+        together = 2 * len(dataset.times) <= len(dataset.train)
+        tracks = tracks_in_images(tracks, clouds.times, images, static, background, together=together)
+    share = 0.0 if tracks is None else explained_share(clouds, tracks, half_side)
+    light: dict[int, Floats] = {}
+    if tracks is not None and share >= config.discovery.least:
+        stands, turns = find_turns(tracks, clouds.times, images)
         if turns:
-            tracks, light = rigid_tracks(tracks, stands, turns, times, images, device, generator)
-    scene = scene_with(static, tracks, config, device, generator, own_field, sheets=sheets)
-    found = f"{share:.1%} of what it lacks can be followed: nothing is added"
-    if tracks is not None:
-        meter = Progress(fit_steps, "steps of motion discovery, part 2 of 2: what moves")
-        error = fit_field(scene, tracks, times, len(static), fit_steps, generator, meter.at, fades=sheets, light=light)
-        if error is None:
-            tracks, scene = None, scene_with(static, None, config, device, generator, own_field)
-            found = f"{share:.1%} of what it lacks can be followed, and the field moves nothing: nothing is added"
-    if tracks is not None:
-        found = (
-            f"{len(np.unique(tracks.part))} moving parts with {len(tracks.part)} Gaussians, {share:.0%} of what it "
-            f"lacks, followed within {error:.3f} world units"
-        )
-        if light:
-            found += f", {len(light)} of them as rigid bodies"
-    order = morton_order(scene.parameters["means"].detach())
-    for name, values in scene.parameters.items():
-        scene.parameters[name] = torch.nn.Parameter(values.detach()[order])
+            tracks, light = rigid_tracks(tracks, stands, turns, clouds.times, images, device, generator)
     meter.clear()
-    summary = f"a static fit of {len(static)} Gaussians; {found}"
-    field_fitted = 0.0
-    if tracks is not None and share >= NEARLY_ALL:
-        field_fitted = ALL_TURN if len(light) == len(np.unique(tracks.part)) else 1.0
-    return Start(
-        scene,
-        ramp_steps=config.schedule.warm_up or RAMP_STEPS,
-        field_fitted=field_fitted,
-        corrections=corrections,
-        summary=summary,
-        seconds=time.perf_counter() - started,
-    )
+    return _Found(static, tracks, clouds.times, share, STATIC_FIT, light=light, corrections=corrections)
 
 
 def scene_with(

@@ -24,6 +24,7 @@ FILM, MASKS = "a film with masks of what moves", "masks"  # the latter is lapgs-
 PRESETS = {
     FILM: ("film-full", "film"),
     "one moving camera": ("hypernerf", "hypernerf-tiny"),
+    "static cameras all around": ("rig-full", "rig"),
     "static cameras": ("neu3d", "neu3d-tiny"),
     "cameras all around": ("dnerf", "tiny"),
 }
@@ -56,7 +57,7 @@ class Plan(NamedTuple):
 def camera_layout(dataset: Dataset) -> str:
     """How the cameras of a capture are arranged: a key of PRESETS other than FILM."""
     if dataset.still_cameras:
-        return "static cameras"
+        return "static cameras all around" if dataset.is_surrounded else "static cameras"
     return "one moving camera" if dataset.own_footage or dataset.cloud is not None else "cameras all around"
 
 
@@ -96,7 +97,8 @@ def plan_training(
     small = PRESETS[layout][1]
     for preset in (small,) if device.is_cpu else PRESETS[layout]:
         last = preset == small
-        config = load_config(preset, {"data.path": str(folder.resolve()), "exposure.enabled": exposure})
+        own = {"exposure.enabled": True} if exposure else {}
+        config = load_config(preset, {"data.path": str(folder.resolve())} | own)
         # No densification beyond twice the initial number, so that the measured step tells of the whole training.
         config = changed(config, {"density.limit": 2 * config.points.count})
         dataset = open_dataset(config)

@@ -1,0 +1,80 @@
+"""Points of what moves between cameras that stand all around: the visual hull of what differs from their medians.
+
+Something is at a place if nearly all cameras that see the place, AROUND or more, show what they usually do not. Source:
+Laurentini, The visual hull concept for silhouette-based image understanding (PAMI 1994).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lapgs_wgpu.data.evenly import evenly, evenly_indices
+from lapgs_wgpu.data.views import AROUND, Dataset, View, small_views
+from lapgs_wgpu.discovery.residual import Mask, cubic_grid
+from lapgs_wgpu.discovery.surface_points import PointClouds, Points
+from lapgs_wgpu.progress import counted
+
+SIDE = 160  # pixels, of the images that are compared
+IMAGES = 25  # of a camera, whose median is what it usually shows
+CELLS = 96  # along each axis of the cube
+DIFFERENT = 20.0  # levels of 255; mean of channels and neighboring pixels, from which on a pixel differs
+AGREEING = 0.9  # share of the cameras that see a place, in which it differs
+POINTS = 1500  # of a time, at most
+
+
+class _StillCamera(NamedTuple):
+    """views: small ones, by time. usual: (h, w, 3). pixel: (n,) that shows each place, -1 where none does."""
+
+    views: dict[float, View]
+    usual: NDArray[np.float32]
+    pixel: NDArray[np.int32]
+
+
+def hull_points(dataset: Dataset, half_side: float) -> PointClouds:
+    """Points of what moves within [-half_side, half_side]^3, for each time of a rig's clip. Raises InputError where an
+    image cannot be read."""
+    places = cubic_grid((np.arange(CELLS) + 0.5) / CELLS * 2 * half_side - half_side)
+    cameras = [
+        _still_camera([view for view in dataset.train if view.camera is camera], places) for camera in dataset.cameras
+    ]
+    clouds = []
+    for time in counted(dataset.times, len(dataset.times), "times searched for what moves"):
+        seeing, agreeing = np.zeros((2, len(places)), np.int32)
+        shown = []
+        for camera in cameras:
+            if (view := camera.views.get(float(time))) is None:
+                continue
+            image = view.load()[..., :3]
+            differs = ndimage.uniform_filter(np.abs(image - camera.usual).mean(axis=2), 3) > DIFFERENT
+            shown.append((image, differs, camera.pixel))
+            seeing += camera.pixel >= 0
+            agreeing += _at(ndimage.binary_dilation(differs), camera.pixel)
+        there = np.flatnonzero((seeing >= AROUND) & (agreeing >= AGREEING * seeing))
+        there = there[evenly_indices(len(there), POINTS)]
+        colors = np.full((len(shown), len(there), 3), np.nan, np.float32)
+        for color, (image, differs, pixel) in zip(colors, shown, strict=True):
+            shows = _at(differs, pixel[there])
+            color[shows] = image.reshape(-1, 3)[pixel[there[shows]]] / 255
+        known = np.isfinite(colors).any(axis=(0, 2))
+        color = np.nanmedian(colors[:, known], axis=0)  # in some cameras something else is before it
+        clouds.append(Points(places[there[known]].astype(np.float32), color, np.ones(len(color), np.float32)))
+    return PointClouds(dataset.times, tuple(clouds))
+
+
+def _still_camera(views: list[View], places: NDArray[np.float32]) -> _StillCamera:
+    small = sorted(small_views(views, SIDE), key=lambda view: view.time)
+    usual = np.median([view.load()[..., :3] for view in evenly(small, IMAGES)], axis=0).astype(np.float32)
+    camera = small[0].camera
+    pixels, depths = camera.project(places)
+    inside = (depths > 1e-9) & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
+    column, row = np.where(inside[:, None], pixels, 0).astype(np.int32).T
+    return _StillCamera({view.time: view for view in small}, usual, np.where(inside, row * camera.width + column, -1))
+
+
+def _at(mask: Mask, pixel: NDArray[np.int32]) -> Mask:
+    """(n,) the mask at pixels (n,), False where these are -1."""
+    return np.append(mask.ravel(), False)[pixel]
