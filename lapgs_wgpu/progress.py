@@ -21,7 +21,8 @@ class Progress:
     def __init__(self, total: int, what: str, stream: TextIO | None = None) -> None:
         self._total, self._what, self._done = total, what, 0
         self._stream = stream or sys.stderr
-        self._start = self._shown = time.perf_counter()
+        self._shown = time.perf_counter()
+        self._first: tuple[int, float] | None = None  # step, and when it was done: what comes before it may take long
 
     def __enter__(self) -> Progress:
         return self
@@ -37,9 +38,11 @@ class Progress:
         self.at(self._done + 1)
 
     def at(self, done: int, text: Callable[[], str] | None = None) -> None:
-        """`done` steps are done. text: makes the line, by default the count and the time left at the mean rate."""
+        """`done` steps are done. text: makes the line, by default the count and the time left at the mean rate since
+        the first call."""
         self._done = done
         now, on_terminal = time.perf_counter(), self._stream.isatty()
+        self._first = self._first or (done, now)
         if done == self._total or self.due:
             self._shown = now
             line = text() if text else self._line(now)
@@ -62,8 +65,11 @@ class Progress:
             self._write(in_place("") + "\r")
 
     def _line(self, now: float) -> str:
-        left = (now - self._start) / self._done * (self._total - self._done)
-        return f"{self._done}/{self._total} {self._what}  {duration(left)} left"
+        first, since = self._first or (self._done, now)
+        line = f"{self._done}/{self._total} {self._what}"
+        if self._done == first:
+            return line
+        return f"{line}  {duration((now - since) / (self._done - first) * (self._total - self._done))} left"
 
     def _write(self, text: str) -> None:
         with suppress(OSError):  # a closed pipe or a full disk behind stderr does not stop the job
