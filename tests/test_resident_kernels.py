@@ -178,7 +178,7 @@ def test_values_that_are_not_finite_are_found(device: Device, value: float, plac
 
 @pytest.mark.parametrize(("count", "gaussians"), [(1, 1), (7, 100), (100, 100), (33, 70)])
 def test_samples_are_different_rows_and_places_near_them(device: Device, count: int, gaussians: int) -> None:
-    samples = Samples(count, gaussians, 5 % gaussians, 1234567, 0.25)
+    samples = Samples(count, gaussians, 1234567, 0.25)
     rows = sampled_rows.rows(samples)
     assert len(set(rows.tolist())) == count
     geometry, pool = random(gaussians, 12), BufferPool(device)
@@ -198,7 +198,7 @@ def test_samples_are_different_rows_and_places_near_them(device: Device, count: 
 
 
 def test_offsets_fill_their_cube() -> None:
-    offsets: Tensor = sampled_rows.offsets(Samples(2000, 2000, 0, 42, 1.0))
+    offsets: Tensor = sampled_rows.offsets(Samples(2000, 2000, 42, 1.0))
     assert offsets.abs().max() <= 1
     assert offsets.mean(dim=0).abs().max() < 0.06
     assert (offsets.std(dim=0) - 3**-0.5).abs().max() < 0.03

@@ -168,10 +168,10 @@ class ResidentStep:
         config, count, fitted = self._config, len(self._scene), self._learners.field_fitted > 0
         near, even = compared_counts(config, task.scheduled, count, self._time_count, fitted=fitted)
         if near:
-            task.near = Samples(near, count, *_draw_rows(count, generator), config.smoothness.reach)
+            task.near = Samples(near, count, _draw_seed(generator), config.smoothness.reach)
             task.near_time = near_time(config.smoothness, task.time, generator)
         if even:
-            task.even = Samples(even, count, *_draw_rows(count, generator))
+            task.even = Samples(even, count, _draw_seed(generator))
             task.even_times = even_times(task.time, self._time_count, generator)
 
     def _push(self) -> None:
@@ -287,7 +287,5 @@ class ResidentStep:
         return flying
 
 
-def _draw_rows(count: int, generator: torch.Generator) -> tuple[int, int]:
-    """First row and seed of samples."""
-    first, seed = torch.randint(1 << 31, (2,), generator=generator).tolist()
-    return first % count, seed
+def _draw_seed(generator: torch.Generator) -> int:
+    return int(torch.randint(1 << 31, (), generator=generator))

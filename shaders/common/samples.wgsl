@@ -1,11 +1,10 @@
-// Gaussians that a step looks at more closely: one of each stretch of neighboring rows, all different.
+// Gaussians that a step looks at more closely, drawn at random, all different.
 
 struct Samples {
     count: u32,
     gaussians: u32,
-    first: u32,      // row at which the first stretch begins
-    stretch: u32,    // rows, at most gaussians / count
-    seed: u32,       // of the places within stretches, and of offsets
+    half_bits: u32,  // 2 * half_bits number the rows
+    seed: u32,       // of the rows, and of offsets
     reach: f32,      // largest offset along each axis, world units
 }
 
@@ -20,8 +19,21 @@ fn draw(s: Samples, i: u32, number: u32) -> u32 {
     return scrambled(s.seed ^ scrambled(4u * i + number));
 }
 
+// The i-th row of a random permutation: a Feistel network of four rounds over all numbers of so many bits, walked on
+// until it gives a row. Source: Black and Rogaway, Ciphers with arbitrary finite domains (2002).
 fn row_of(s: Samples, i: u32) -> u32 {
-    return (s.first + i * s.stretch + draw(s, i, 0u) % s.stretch) % s.gaussians;
+    let low = (1u << s.half_bits) - 1u;
+    var row = i;
+    loop {
+        for (var round = 0u; round < 4u; round++) {
+            let right = row & low;
+            row = (right << s.half_bits) | ((row >> s.half_bits) ^ (draw(s, right, round) & low));
+        }
+        if (row < s.gaussians) {
+            break;
+        }
+    }
+    return row;
 }
 
 // Evenly distributed in [-reach, reach)^3.

@@ -21,12 +21,17 @@ def draw(samples: Samples, i: int, number: int) -> int:
     return scrambled(samples.seed ^ scrambled(4 * i + number))
 
 
+def row(samples: Samples, i: int) -> int:
+    low = (1 << samples.half_bits) - 1
+    while True:
+        for turn in range(4):
+            i = ((i & low) << samples.half_bits) | ((i >> samples.half_bits) ^ (draw(samples, i & low, turn) & low))
+        if i < samples.gaussians:
+            return i
+
+
 def rows(samples: Samples) -> Tensor:
-    stretch = max(1, samples.gaussians // max(1, samples.count))
-    found = [
-        (samples.first + i * stretch + draw(samples, i, 0) % stretch) % samples.gaussians for i in range(samples.count)
-    ]
-    return torch.tensor(found)
+    return torch.tensor([row(samples, i) for i in range(samples.count)])
 
 
 def offsets(samples: Samples) -> Tensor:

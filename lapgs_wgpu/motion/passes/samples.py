@@ -1,4 +1,4 @@
-"""Gaussians that a step looks at more closely, drawn on the device: one of each stretch of neighboring rows."""
+"""Gaussians that a step looks at more closely, drawn on the device."""
 
 from __future__ import annotations
 
@@ -14,22 +14,24 @@ from lapgs_wgpu.gpu.pool import BufferPool
 
 @dataclass(frozen=True)
 class Samples:
-    """`count` of so many Gaussians, all different (common/samples.wgsl).
+    """`count` of so many Gaussians, at random, all different (common/samples.wgsl).
 
-    first: row at which the first stretch begins. seed: of 32 bits, of the places within stretches, and of offsets.
-    reach: largest offset along each axis, world units.
+    seed: of 32 bits, of the rows and of offsets. reach: largest offset along each axis, world units.
     """
 
     count: int
     gaussians: int
-    first: int = 0
     seed: int = 0
     reach: float = 0.0
 
+    @property
+    def half_bits(self) -> int:
+        """Half of the bits that number the Gaussians, rounded up."""
+        return -(-(self.gaussians - 1).bit_length() // 2)
+
     def uniform(self, kernel: Kernel) -> bytes:
         """The content of the struct Samples of a kernel that has it."""
-        stretch = max(1, self.gaussians // max(1, self.count))
-        return kernel.uniform("Samples", stretch=stretch, **vars(self))
+        return kernel.uniform("Samples", half_bits=self.half_bits, **vars(self))
 
 
 Sampling = Callable[[], Samples]  # gives the samples of the step that is taken, whose number is the same in each
