@@ -120,9 +120,9 @@ def _in_hull(config: Config, dataset: Dataset, device: Device) -> _Found | None:
     """What moves between cameras all around, before initial points; None where nothing can be followed."""
     clouds = hull_points(dataset, config.points.box)
     tracks = find_tracks(clouds, config.points.box)
-    if tracks is None:
+    share = 0.0 if tracks is None else explained_share(clouds, tracks, config.points.box)
+    if share < config.discovery.least:
         return None
-    share = explained_share(clouds, tracks, config.points.box)
     return _Found(start_from_points(config, dataset, device).scene, tracks, clouds.times, share, "a start")
 
 

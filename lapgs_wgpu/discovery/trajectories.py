@@ -80,7 +80,10 @@ def find_trajectories(clouds: PointClouds, link: float, half_side: float) -> lis
         paths.append(path)
     at_once = int(np.quantile(np.bincount(groups.time, minlength=len(clock)), AT_ONCE))
     given = _one_to_one(groups, paths[:at_once], clock, half_side) + paths[at_once:]
-    return [[_smooth(groups, path, clock) for path in each] for each in ([given] if given == paths else [given, paths])]
+    return [
+        [_smooth(groups, path, clock, bent=True) for path in each]
+        for each in ([given] if given == paths else [given, paths])
+    ]
 
 
 def _groups(clouds: PointClouds, clock: NDArray[np.float64], link: float) -> _Groups:
@@ -204,20 +207,25 @@ def _change(groups: _Groups, before: list[int], after: list[int]) -> float:
     return float(np.linalg.norm(np.median(groups.colors[before], axis=0) - np.median(groups.colors[after], axis=0)))
 
 
-def _smooth(groups: _Groups, path: list[int], clock: NDArray[np.float64], *, alone: bool = False) -> Trajectory:
+def _smooth(
+    groups: _Groups, path: list[int], clock: NDArray[np.float64], *, alone: bool = False, bent: bool = False
+) -> Trajectory:
     """The path at every time (T,): a straight line fitted to the groups around it, by weights that fall off in time.
 
-    alone: whether by those of other times alone."""
+    alone: whether by those of other times alone. bent: whether a parabola where it leaps over times, in which what
+    circles turns."""
     centers = groups.centers[path]
     lapses = groups.clock[path] - clock[:, None]
     counted = lapses != 0 if alone else np.full(lapses.shape, fill_value=True)
     nearest = np.where(counted, np.abs(lapses), np.inf).min(axis=1)[:, None]
-    weights = counted * np.exp(-0.5 * (lapses / (WINDOW + nearest)) ** 2)
+    leapt = bent & (nearest > 0) & (lapses[:, :1] < 0) & (lapses[:, -1:] > 0)
+    weights = counted * np.exp(-0.5 * (lapses / (WINDOW + np.where(leapt, 0.5, 1.0) * nearest)) ** 2)
     result = np.zeros((len(clock), 3), np.float32)
     for i, (weight, lapse) in enumerate(zip(weights, lapses, strict=True)):
-        basis = np.stack([np.ones_like(lapse), lapse], axis=1)
+        basis = np.vander(lapse, 3 if leapt[i, 0] else 2, increasing=True)
         product = basis.T * weight
-        ridge = np.diag([0.0, 1e-3 + nearest[i, 0]])  # beyond its ends a path hardly goes on
+        # Beyond its ends a path hardly goes on.
+        ridge = np.diag([0.0, 1e-3, 1e-2] if leapt[i, 0] else [0.0, 1e-3 + nearest[i, 0]])
         result[i] = np.linalg.solve(product @ basis + ridge, product @ centers)[0]
     seen = np.zeros(len(clock), bool)
     seen[groups.time[path]] = True

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lapgs_wgpu.data.evenly import evenly, evenly_indices
-from lapgs_wgpu.data.views import AROUND, Dataset, View, small_views
+from lapgs_wgpu.data.views import AROUND, Dataset, View, composite, small_views
 from lapgs_wgpu.discovery.residual import Mask, cubic_grid
 from lapgs_wgpu.discovery.surface_points import PointClouds, Points
 from lapgs_wgpu.progress import counted
@@ -24,6 +24,7 @@ CELLS = 96  # along each axis of the cube
 DIFFERENT = 20.0  # levels of 255; mean of channels and neighboring pixels, from which on a pixel differs
 AGREEING = 0.9  # share of the cameras that see a place, in which it differs
 POINTS = 1500  # of a time, at most
+BLACK = 0.0, 0.0, 0.0
 
 
 class _StillCamera(NamedTuple):
@@ -48,7 +49,7 @@ def hull_points(dataset: Dataset, half_side: float) -> PointClouds:
         for camera in cameras:
             if (view := camera.views.get(float(time))) is None:
                 continue
-            image = view.load()[..., :3]
+            image = composite(view.load(), BLACK)
             differs = ndimage.uniform_filter(np.abs(image - camera.usual).mean(axis=2), 3) > DIFFERENT
             shown.append((image, differs, camera.pixel))
             seeing += camera.pixel >= 0
@@ -67,7 +68,7 @@ def hull_points(dataset: Dataset, half_side: float) -> PointClouds:
 
 def _still_camera(views: list[View], places: NDArray[np.float32]) -> _StillCamera:
     small = sorted(small_views(views, SIDE), key=lambda view: view.time)
-    usual = np.median([view.load()[..., :3] for view in evenly(small, IMAGES)], axis=0).astype(np.float32)
+    usual = np.median([composite(view.load(), BLACK) for view in evenly(small, IMAGES)], axis=0).astype(np.float32)
     camera = small[0].camera
     pixels, depths = camera.project(places)
     inside = (depths > 1e-9) & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
