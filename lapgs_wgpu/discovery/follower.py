@@ -37,11 +37,11 @@ WIDE, NARROW = 0.6, 0.35  # standard deviation of the registration, first and la
 
 
 class Follower:
-    """Follows the parts of a key time's points."""
+    """Follows the parts of a key time's points. tint: of `PointClouds`."""
 
-    def __init__(self, template: Points, half_side: float) -> None:
+    def __init__(self, template: Points, half_side: float, tint: float = 0.0) -> None:
         unit = UNIT * half_side
-        part = parts_of(template.positions, LINK * half_side)
+        part = parts_of(template, LINK * half_side, tint)
         kept = np.bincount(part)[part] >= LEAST_PART
         self.positions, self.colors = template.positions[kept], template.colors[kept]
         self.part = np.unique(part[kept], return_inverse=True)[1].ravel()

@@ -58,10 +58,12 @@ def merged(parts: Iterable[Points]) -> Points:
 
 
 class PointClouds(NamedTuple):
-    """The surface points of all times (T,), ascending, and the cloud of each."""
+    """The surface points of all times (T,), ascending, and the cloud of each. tint: how far apart points of one place
+    are that differ by 1 in color, world units, where their colors tell things that touch."""
 
     times: NDArray[np.float64]
     clouds: tuple[Points, ...]
+    tint: float = 0.0
 
     @property
     def total(self) -> int:
@@ -174,8 +176,10 @@ def _dense(points: Points, half_side: float) -> Points:
     return points.chosen(distances[:, 4] < LONELY * half_side)
 
 
-def parts_of(positions: Floats, link: float) -> NDArray[np.int64]:
-    """(n,) number of the connected part of each point (n, 3), where points closer than `link` are connected."""
+def parts_of(points: Points, link: float, tint: float) -> NDArray[np.int64]:
+    """(n,) number of the connected part of each point, where points closer than `link` are connected. tint: of
+    `PointClouds`."""
+    positions = np.hstack([points.positions, tint * points.colors]) if tint else points.positions
     pairs, count = cKDTree(positions).query_pairs(link, output_type="ndarray"), len(positions)
     graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
     return connected_components(graph, directed=False)[1].astype(np.int64)

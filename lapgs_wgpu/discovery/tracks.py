@@ -117,14 +117,14 @@ def _tracks_by(many: float, clouds: PointClouds, trajectories: list[Trajectory],
     found: list[Tracks] = []
     for _ in range(KEY_TIMES):
         rest = [cloud.chosen(mask) for cloud, mask in zip(clouds.clouds, free, strict=True)]
-        key = _key_time(rest, many, half_side)
+        key = _key_time(rest, many, half_side, clouds.tint)
         if sum(len(points.scores) for points in rest) < LEAST_REST * clouds.total or key is None:
             break
         weighted = [
             points._replace(scores=points.scores * np.where(mask, 1.0, EXPLAINED).astype(np.float32))
             for points, mask in zip(clouds.clouds, free, strict=True)
         ]
-        followed = _tracks_from(key, _merged(rest, key), clouds.times, weighted, trajectories, half_side)
+        followed = _tracks_from(key, _merged(rest, key), clouds.times, weighted, trajectories, half_side, clouds.tint)
         if followed is None:
             break
         if (steady := followed[0].of_parts(_steady(*followed, clouds.clouds, half_side))) is not None:
@@ -137,10 +137,10 @@ def _tracks_by(many: float, clouds: PointClouds, trajectories: list[Trajectory],
     return all_of([each._replace(part=each.part + offset) for each, offset in zip(found, offsets, strict=True)])
 
 
-def _key_time(clouds: list[Points], many: float, half_side: float) -> int | None:
+def _key_time(clouds: list[Points], many: float, half_side: float, tint: float) -> int | None:
     """The time of most points among those at which many parts are apart."""
     some = [points.thinned(PROBES) for points in clouds]
-    parts = np.array([_count_parts(_merged(some, i), half_side) for i in range(len(clouds))])
+    parts = np.array([_count_parts(_merged(some, i), half_side, tint) for i in range(len(clouds))])
     if not parts.any():
         return None
     usual = int(np.quantile(parts[parts > 0], many))
@@ -155,10 +155,10 @@ def _merged(clouds: list[Points], i: int) -> Points:
     return merged(clouds[max(0, i - 1) : i + 2])
 
 
-def _count_parts(points: Points, half_side: float) -> int:
+def _count_parts(points: Points, half_side: float, tint: float) -> int:
     if len(points.scores) < LEAST_PART:
         return 0
-    sizes = np.bincount(parts_of(points.positions, LINK * half_side))
+    sizes = np.bincount(parts_of(points, LINK * half_side, tint))
     return int((sizes >= LEAST_PART).sum())
 
 
@@ -185,6 +185,7 @@ def _tracks_from(
     clouds: list[Points],
     trajectories: list[Trajectory],
     half_side: float,
+    tint: float,
 ) -> tuple[Tracks, Floats] | None:
     """The points of a key time, followed twice: first those of that time, then with all that belongs to them.
 
@@ -193,7 +194,7 @@ def _tracks_from(
     template = _voxels(start, VOXEL * half_side, least=1).thinned(ROUGH)
     found = None
     for last in (False, True):
-        follower = Follower(template, half_side)
+        follower = Follower(template, half_side, tint)
         if len(follower.positions) == 0:
             break
         paths = follower.follow(key, times, clouds, trajectories)

@@ -89,7 +89,7 @@ def find_trajectories(clouds: PointClouds, link: float, half_side: float) -> lis
 def _groups(clouds: PointClouds, clock: NDArray[np.float64], link: float) -> _Groups:
     rows = []
     for i, points in enumerate(clouds.clouds):
-        part = parts_of(points.positions, link)
+        part = parts_of(points, link, clouds.tint)
         for k in np.flatnonzero(np.bincount(part, minlength=1) >= LEAST_GROUP):
             members = part == k
             center, color = points.positions[members].mean(axis=0), points.colors[members].mean(axis=0)

@@ -24,6 +24,7 @@ CELLS = 96  # along each axis of the cube
 DIFFERENT = 20.0  # levels of 255; mean of channels and neighboring pixels, from which on a pixel differs
 AGREEING = 0.9  # share of the cameras that see a place, in which it differs
 POINTS = 1500  # of a time, at most
+TINT = 1.0  # box half sides: hands that hold a ball are not of one color with it
 BLACK = 0.0, 0.0, 0.0
 
 
@@ -63,7 +64,7 @@ def hull_points(dataset: Dataset, half_side: float) -> PointClouds:
         known = np.isfinite(colors).any(axis=(0, 2))
         color = np.nanmedian(colors[:, known], axis=0)  # in some cameras something else is before it
         clouds.append(Points(places[there[known]].astype(np.float32), color, np.ones(len(color), np.float32)))
-    return PointClouds(dataset.times, tuple(clouds))
+    return PointClouds(dataset.times, tuple(clouds), TINT * half_side)
 
 
 def _still_camera(views: list[View], places: NDArray[np.float32]) -> _StillCamera:
