@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -45,11 +46,12 @@ def test_a_ball_is_found_and_followed() -> None:
     dataset = rig()
     assert camera_layout(dataset) == "static cameras all around"
     assert camera_layout(rig(circle=False)) == "static cameras"
-    clouds = hull_points(dataset, HALF)
+    dark = [replace(view, pixels=lambda: np.zeros((60, 80, 3), np.uint8)) for view in dataset.train[:5]]
+    clouds = hull_points(replace(dataset, train=(*dark, *dataset.train[5:])), HALF)
     for time, cloud in zip(TIMES, clouds.clouds, strict=True):
         assert np.linalg.norm(cloud.positions - center(time), axis=1).max() < 1.5 * RADIUS
         assert len(cloud.scores) > 0.9 * POINTS  # fewer than its cells
-        assert np.quantile(np.abs(cloud.colors - COLOR), 0.9) < 0.01  # the rim may be gray
+        assert np.quantile(np.abs(cloud.colors - COLOR), 0.8) < 0.01  # the rim may be gray
     tracks = find_tracks(clouds, HALF)
     assert tracks is not None
     assert np.abs(tracks.paths.mean(axis=1) - [center(time) for time in TIMES]).max() < 0.3 * RADIUS

@@ -22,6 +22,7 @@ SIDE = 160  # pixels, of the images that are compared
 IMAGES = 25  # of a camera, whose median is what it usually shows
 CELLS = 96  # along each axis of the cube
 DIFFERENT = 20.0  # levels of 255; mean of channels and neighboring pixels, from which on a pixel differs
+WHOLE = 0.5  # share of an image, above which not what moves differs, but its exposure
 AGREEING = 0.9  # share of the cameras that see a place, in which it differs
 POINTS = 1500  # of a time, at most
 TINT = 1.0  # box half sides: hands that hold a ball are not of one color with it
@@ -52,6 +53,8 @@ def hull_points(dataset: Dataset, half_side: float) -> PointClouds:
                 continue
             image = composite(view.load(), BLACK)
             differs = ndimage.uniform_filter(np.abs(image - camera.usual).mean(axis=2), 3) > DIFFERENT
+            if differs.mean() > WHOLE:
+                continue
             shown.append((image, differs, camera.pixel))
             seeing += camera.pixel >= 0
             agreeing += _at(ndimage.binary_dilation(differs), camera.pixel)
