@@ -30,11 +30,16 @@ def are_parallel(cameras: Sequence[Camera]) -> bool:
     return bool(np.linalg.eigvalsh(_across(cameras).mean(axis=0))[0] < PARALLEL)
 
 
+def directions(cameras: Sequence[Camera], focus: NDArray[np.floating]) -> Array:
+    """(N, 3) unit vectors from what the cameras look at (3,) to each of them."""
+    rays = np.stack([camera.position - focus for camera in cameras])
+    return rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
+
+
 def degrees_apart(cameras: Sequence[Camera], focus: NDArray[np.floating]) -> float:
     """The angle between a camera and the nearest other one, seen from what they look at (3,): the median over them; 0
     for one camera."""
-    rays = np.stack([camera.position - focus for camera in cameras])
-    rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
+    rays = directions(cameras, focus)
     nearest = np.sort(np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1))), axis=1)[:, 1:2]
     return float(np.median(nearest)) if nearest.size else 0.0
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lapgs_wgpu.data.cloud import Cloud
-from lapgs_wgpu.data.focus import focus_of, spread
+from lapgs_wgpu.data.focus import directions, focus_of, spread
 from lapgs_wgpu.data.images import Size, shrink
 from lapgs_wgpu.data.masks import MOSTLY, as_pixels
 from lapgs_wgpu.data.normalize import BOX, Normalization
@@ -140,9 +140,7 @@ class Dataset:
         """Whether still cameras stand all around what they look at, AROUND of them or more at each time."""
         if not self.is_rig or len(self.train) < AROUND * len(self.times):
             return False
-        rays = np.stack([camera.position - self.focus for camera in self.cameras])
-        rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
-        return bool(np.linalg.norm(rays.mean(axis=0)) < ONE_SIDED)
+        return bool(np.linalg.norm(directions(self.cameras, self.focus).mean(axis=0)) < ONE_SIDED)
 
     @cached_property
     def moments(self) -> int:
