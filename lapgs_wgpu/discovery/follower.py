@@ -39,7 +39,7 @@ WIDE, NARROW = 0.6, 0.35  # standard deviation of the registration, first and la
 class Follower:
     """Follows the parts of a key time's points. tint: of `PointClouds`."""
 
-    def __init__(self, template: Points, half_side: float, tint: float = 0.0) -> None:
+    def __init__(self, template: Points, half_side: float, tint: float) -> None:
         unit = UNIT * half_side
         part = parts_of(template, LINK * half_side, tint)
         kept = np.bincount(part)[part] >= LEAST_PART
