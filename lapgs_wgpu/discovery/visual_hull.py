@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lapgs_wgpu.data.evenly import evenly, evenly_indices
+from lapgs_wgpu.data.plane_sweep import IMAGES
 from lapgs_wgpu.data.views import AROUND, Dataset, View, composite, small_views
 from lapgs_wgpu.discovery.residual import Mask, cubic_grid
 from lapgs_wgpu.discovery.surface_points import PointClouds, Points
 from lapgs_wgpu.progress import counted
 
 SIDE = 160  # pixels, of the images that are compared
-IMAGES = 25  # of a camera, whose median is what it usually shows
 CELLS = 96  # along each axis of the cube
 DIFFERENT = 20.0  # levels of 255; mean of channels and neighboring pixels, from which on a pixel differs
 WHOLE = 0.5  # share of an image, above which not what moves differs, but its exposure
