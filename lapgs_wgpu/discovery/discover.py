@@ -1,4 +1,4 @@
-"""What a training starts from: the static fit, and what it loses of the things that move."""
+"""What a training starts from: what stands still, and the things that move, which a fit of it loses."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ SHOWN = 2.0 / 255  # least difference from the background of an image that shows
 def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Module | None = None) -> Start:
     """Find what moves, and build the scene that a training starts from.
 
-    It holds the Gaussians of the static fit and those of the tracks, if there are any, and a field that moves the
-    latter. It moves from the first step on. The rates rise first: Adam's first steps, all of the size of the rate,
-    would shake off what the field knows.
+    It holds the Gaussians of the static fit, or initial ones between cameras all around, those of the tracks, if there
+    are any, and a field that moves the latter. It moves from the first step on. The rates rise first: Adam's first
+    steps, all of the size of the rate, would shake off what the field knows.
 
     Args:
         config: resolved for the dataset.
@@ -168,7 +168,7 @@ def scene_with(
     *,
     sheets: bool = False,
 ) -> Scene4D:
-    """The static fit's Gaussians, then one for each track; the field does not move them yet."""
+    """The Gaussians of what stands still, then one for each track; the field does not move them yet."""
     dynamics = torch.zeros(len(static), config.field.dynamics_size)
     if tracks is None:
         rows = {name: values.detach().cpu() for name, values in static.parameters.items()}
