@@ -23,7 +23,7 @@ from lapgs_wgpu.motion.playback.linear_pieces import Pieces, displacement, linea
 from lapgs_wgpu.motion.playback.playback import Playback
 from lapgs_wgpu.splat.linear_light import directions, display_colors, linear_harmonics, sh_basis, to_display, to_linear
 from lapgs_wgpu.viewer.export_4dgs import best_degree, export_4dgs
-from lapgs_wgpu.viewer.export_loss import measure, of_playback
+from lapgs_wgpu.viewer.export_loss import measure
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene, load_scene
 from lapgs_wgpu.viewer.plain_opacity import plain_factors
 
@@ -93,7 +93,7 @@ def test_the_viewer_opens_it(scene: LoadedScene, exported: Path, device: Device)
     read = load_scene(exported, lambda: device)
     assert read.clock().seconds == pytest.approx(scene.clock().seconds, abs=0.04)
     assert (read.playback.at(0.3).opacities.read() > 0).sum() == COUNT
-    assert measure(scene, of_playback(read.playback, fourdgs.read(exported).gaussians.source_index)).psnr > 30
+    assert measure(scene, read.playback, fourdgs.read(exported).gaussians.source_index).psnr > 30
 
 
 def test_what_was_trained_antialiased_is_fitted_to_plain_drawing(device: Device, tmp_path: Path) -> None:
@@ -104,7 +104,7 @@ def test_what_was_trained_antialiased_is_fitted_to_plain_drawing(device: Device,
         small.parameters["log_scales"] -= 4.0
     small.save(tmp_path / "a.ply")
     scene, plain = (load_scene(tmp_path / "a.ply", lambda: device, antialiased=how) for how in (None, False))
-    thick = measure(scene, of_playback(plain.playback)).psnr
+    thick = measure(scene, plain.playback).psnr
     assert export_4dgs(scene, tmp_path / "a.4dgs", 0.5).psnr > thick + 4
     factors = plain_factors(scene)
     assert factors.shape == (COUNT,)

@@ -16,7 +16,7 @@ from lapgs_wgpu.motion.playback.playback import playback_of
 from lapgs_wgpu.motion.scene_file import SceneFile
 from lapgs_wgpu.viewer.cli import view_command
 from lapgs_wgpu.viewer.export import export_compact
-from lapgs_wgpu.viewer.export_loss import measure, of_playback
+from lapgs_wgpu.viewer.export_loss import measure
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene, load_scene
 
 COUNT = 1000
@@ -62,7 +62,7 @@ def test_the_gaussians_that_differ_are_told(scene: LoadedScene, device: Device, 
     values = file.gaussians[name].copy()
     near = np.argsort(np.linalg.norm(file.gaussians["means"], axis=1) + (np.arange(COUNT + 6) < 4))[:count]
     values[near] += {"means": 0.5, "log_scales": 2.0, "opacity_logits": -12.0, "sh_dc": 9.0}[name]
-    loss = measure(scene, of_playback(playback_of(replace(file, gaussians=file.gaussians | {name: values}), device)))
+    loss = measure(scene, playback_of(replace(file, gaussians=file.gaussians | {name: values}), device))
     assert loss.psnr < 40
     assert loss.reason.startswith(told)
 
@@ -76,4 +76,4 @@ def test_what_the_usual_steps_lose_is_stored_in_finer_ones(device: Device, tmp_p
     loss = export_compact(scene, tmp_path / "a.lapgs")
     assert loss.psnr >= 45
     written = load_scene(tmp_path / "a.lapgs", lambda: device)
-    assert measure(scene, lambda camera, t: (written.playback.at(t), np.arange(COUNT + 4))).psnr == loss.psnr
+    assert measure(scene, written.playback, np.arange(COUNT + 4)).psnr == loss.psnr

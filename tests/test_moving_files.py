@@ -20,7 +20,8 @@ from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.viewer.cli import view_command
 from lapgs_wgpu.viewer.export import export_compact, export_frames
 from lapgs_wgpu.viewer.export_usd import export_usd
-from lapgs_wgpu.viewer.loaded_scene import LoadedScene, load_scene, open_moving
+from lapgs_wgpu.viewer.loaded_scene import LoadedScene, load_scene
+from lapgs_wgpu.viewer.moving_files import open_moving
 
 N = 40
 TIMES = (0.0, 0.4, 1.0)

@@ -15,7 +15,7 @@ from lapgs_wgpu.motion.compact_scene import held_rows
 from lapgs_wgpu.motion.playback.playback import DevicePlayback, playback_of
 from lapgs_wgpu.motion.scene_file import SceneFile, compact_bytes, read_compact, read_scene
 from lapgs_wgpu.progress import counted
-from lapgs_wgpu.viewer.export_loss import Loss, measure, of_playback
+from lapgs_wgpu.viewer.export_loss import Loss, measure
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene, nearest_axis
 from lapgs_wgpu.viewer.moving_files import MANIFEST, SampledPlayback, read_sequence
 from lapgs_wgpu.viewer.offscreen import OffscreenRenderer
@@ -40,7 +40,7 @@ def export_still(scene: LoadedScene, file: Path, time: float) -> Loss:
     Raises InputError where it cannot be written.
     """
     _write_still(scene, file, time)
-    return measure(scene, of_playback(playback_of(read_scene(file), scene.playback.device)), time)
+    return measure(scene, playback_of(read_scene(file), scene.playback.device), time=time)
 
 
 def _write_still(scene: LoadedScene, file: Path, time: float) -> None:
@@ -79,7 +79,7 @@ def export_frames(scene: LoadedScene, folder: Path, frames: int, *, overwrite: b
     with atomic_write(folder / MANIFEST) as target:
         target.write(json.dumps(manifest, indent=1).encode())
     written = SampledPlayback(scene.playback.device, read_sequence(folder / MANIFEST))
-    return measure(scene, of_playback(written), frames=frames)
+    return measure(scene, written, frames=frames)
 
 
 def export_compact(scene: LoadedScene, file: Path) -> Loss:
@@ -107,7 +107,7 @@ def _compact(scene: LoadedScene, opened: SceneFile) -> tuple[bytes, Loss]:
     for finer in _FINER:
         content = compact_bytes(file, features, finer=finer)
         written = playback_of(read_compact(content, file.path), scene.playback.device)
-        loss = measure(scene, of_playback(written, rows))
+        loss = measure(scene, written, rows)
         if loss.psnr > best[1].psnr + 1:
             best = content, loss
         if loss.psnr >= _ENOUGH:

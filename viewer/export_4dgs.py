@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from pathlib import Path
 from typing import Any
@@ -11,19 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError, optional_module
-from lapgs_wgpu.gpu.array import DeviceArray
-from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.playback.linear_pieces import Pieces, linear_pieces
 from lapgs_wgpu.progress import Progress
-from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.constants import CONSTANTS
-from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.linear_light import directions, display_colors, linear_harmonics, sh_basis, to_display
-from lapgs_wgpu.viewer.export_loss import Loss, Written, measure, seen, upload
+from lapgs_wgpu.viewer.export_loss import Loss, measure
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene, nearest_axis
-from lapgs_wgpu.viewer.moving_files import AXES, LAST, SH_RANGE, harmonics_4dgs
+from lapgs_wgpu.viewer.moving_files import AXES, SH_RANGE, SampledPlayback, read_4dgs
 from lapgs_wgpu.viewer.plain_opacity import plain_factors
 
 MAX_ERROR = 0.5  # pixels, without --max-error
@@ -64,10 +59,9 @@ def export_4dgs(scene: LoadedScene, file: Path, max_error: float) -> Loss:
         fov, position, focus = math.degrees(camera.fov_y), tuple(camera.position), tuple(camera.focus)
         view = fourdgs.CameraTrajectory(fov, position, focus, interpolation="linear")
         sh = playback.at(0.0).sh.read()  # (N, K, 3); those of degree 0 change with time
-        written = io.BytesIO()
-        fourdgs.write(written, _gaussian_set(pieces, sh, seconds), seconds, options=options, camera=view)
-        target.write(written.getvalue())
-    return measure(scene, _shown(fourdgs.read(written.getvalue()), playback.device))
+        fourdgs.write(target, _gaussian_set(pieces, sh, seconds), seconds, options=options, camera=view)
+    written = SampledPlayback(playback.device, read_4dgs(file))
+    return measure(scene, written, fourdgs.read(file).gaussians.source_index)
 
 
 def _gaussian_set(pieces: Pieces, sh: NDArray[np.float32], seconds: float) -> Any:
@@ -96,21 +90,6 @@ def _gaussian_set(pieces: Pieces, sh: NDArray[np.float32], seconds: float) -> An
         source_group=np.zeros(len(at), np.int64),
         source_index=pieces.source,
     )
-
-
-def _shown(scene: Any, device: Device) -> Written:
-    gaussians = scene.gaussians
-    light = harmonics_4dgs(gaussians)
-
-    def at(camera: Camera, t: float) -> tuple[Gaussians[DeviceArray], NDArray[np.integer]]:
-        now = gaussians.state_at(min(t, LAST) * scene.duration_sec)
-        rows, means = now["indices"], now["centers"]
-        colors = to_display(seen(means, light[rows], camera).clip(0, 1))
-        quats = np.roll(gaussians.rotations[rows], 1, axis=1)  # xyzw to wxyz
-        arrays = (means, quats, gaussians.scales[rows], now["opacity"], colors)
-        return Gaussians(*(upload(device, values) for values in arrays)), gaussians.source_index[rows]
-
-    return at
 
 
 def best_degree(sh: NDArray[np.floating]) -> int:

@@ -2,39 +2,24 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.gpu.array import DeviceArray
-from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.playback.playback import Playback
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.constants import CONSTANTS
-from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.linear_light import sh_basis
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 
 Floats = NDArray[np.floating]
 Rows = NDArray[np.integer]
-# What a file shows a camera at a time, and which Gaussians of the scene these are.
-Written = Callable[[Camera, float], tuple[Gaussians[DeviceArray], Rows]]
 
 _PICTURES = 4
 _VISIBLE = 40.0  # dB; below it a file has lost what is seen
-# Property -> from which error on a Gaussian counts, and what it then does.
-_ERRORS = {
-    "means": (0.5, "lie off by more than half their size"),
-    "quats": (0.1, "are turned by more than 0.1 rad"),
-    "scales": (0.1, "have another size by more than a tenth"),
-    "opacities": (0.05, "have another opacity by more than 0.05"),
-    "sh": (0.05, "have another color by more than 0.05"),
-}
 
 
 class Loss(NamedTuple):
@@ -44,35 +29,34 @@ class Loss(NamedTuple):
     reason: str
 
 
-def measure(scene: LoadedScene, written: Written, time: float | None = None, frames: int | None = None) -> Loss:
+def measure(
+    scene: LoadedScene,
+    written: Playback,
+    rows: Rows | None = None,
+    *,
+    time: float | None = None,
+    frames: int | None = None,
+) -> Loss:
     """Compare pictures of the captured images' size from around the focus.
 
+    written: the opened file. rows: which of the scene's Gaussians each of its is, where they are not the same.
     time: of all, in [0, 1]; by default from the clip's start to its end. frames: of a sequence, whose times the
     pictures have then.
     """
     rasterizer = Rasterizer(scene.playback.device)
 
-    def drawn(gaussians: Gaussians[DeviceArray], camera: Camera) -> Floats:
+    def drawn(playback: Playback, camera: Camera, t: float) -> Floats:
         """An image (3, height, width), clipped to [0, 1]."""
-        return rasterizer.draw_whole(gaussians, camera, scene.background).image.read()[:3].clip(0, 1)
+        return rasterizer.draw_whole(playback.at(t), camera, scene.background).image.read()[:3].clip(0, 1)
 
-    if time is None and not scene.playback.moves:
-        time = 0.0
     pictures = []
     for camera, t in scene.around(_PICTURES, time):
         t = t if frames is None else round(t * (frames - 1)) / max(1, frames - 1)
-        wanted = drawn(scene.playback.at(t), camera)
-        pictures.append((_psnr(wanted, drawn(written(camera, t)[0], camera)), camera, t, wanted))
-    psnr, camera, t, wanted = min(pictures, key=lambda picture: picture[0])
+        pictures.append((_psnr(drawn(scene.playback, camera, t), drawn(written, camera, t)), camera, t))
+    psnr, camera, t = min(pictures, key=lambda picture: picture[0])
     if psnr >= _VISIBLE:
         return Loss(psnr, "")
-    return Loss(psnr, _reason(scene, written, camera, t, lambda gaussians: _psnr(wanted, drawn(gaussians, camera))))
-
-
-def of_playback(playback: Playback, rows: Rows | None = None) -> Written:
-    """Draw what an opened file holds. rows: Gaussians of the scene that are in it, where not all."""
-    held = np.arange(playback.count) if rows is None else rows
-    return lambda camera, t: (playback.at(t), held)
+    return Loss(psnr, _reason(scene, written, np.arange(written.count) if rows is None else rows, camera, t))
 
 
 def _psnr(true: Floats, found: Floats) -> float:
@@ -80,54 +64,33 @@ def _psnr(true: Floats, found: Floats) -> float:
     return min(100.0, -10 * math.log10(max(error, 1e-20)))
 
 
-def _reason(
-    scene: LoadedScene, written: Written, camera: Camera, t: float, psnr_of: Callable[[Gaussians[DeviceArray]], float]
-) -> str:
-    """Which property, taken from the scene, brings the picture nearest to the scene's, and how many Gaussians differ in
-    it. psnr_of: of a picture from this camera against the scene's, dB."""
-    device = scene.playback.device
-    shown, rows = written(camera, t)
-    exact = scene.playback.at(t)
-    true = {name: array.read()[rows] for name, array in exact.arrays().items()}
-    gains = {}
-    for name, values in true.items():
-        arrays = shown.arrays() | {name: upload(device, values)}
-        gains[name] = psnr_of(Gaussians(**arrays, antialiased=shown.antialiased))
-    if psnr_of(dataclasses.replace(shown, antialiased=exact.antialiased)) > max(gains.values()):
-        return "the scene is drawn antialiased, which the file does not say"
-    name = max(gains, key=gains.__getitem__)
+def _reason(scene: LoadedScene, written: Playback, rows: Rows, camera: Camera, t: float) -> str:
+    """How many Gaussians, of those that the file shows at a time, differ from the scene's, and in what."""
+    shown, exact = written.at(t), scene.playback.at(t)
     found = {name: array.read() for name, array in shown.arrays().items()}
-    most, differ = _ERRORS[name]
-    count = int((_errors(name, true, found, camera) > most).sum())
-    return f"{count:,} of {scene.playback.count:,} Gaussians {differ}"
-
-
-def _errors(name: str, true: dict[str, Floats], found: dict[str, Floats], camera: Camera) -> Floats:
-    """(N,) by how much a property of each Gaussian differs, as _ERRORS counts it."""
-    a: Floats = true[name].astype(np.float64)
-    b: Floats = found[name].astype(np.float64)
-    if name == "means":
-        return np.asarray(np.linalg.norm(a - b, axis=1) / np.median(true["scales"], axis=1))
-    if name == "quats":
-        cosine = np.abs((a * b).sum(axis=1)) / (np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1))
-        return np.asarray(2 * np.arccos(cosine.clip(0, 1)))
-    if name == "scales":
-        return np.asarray(np.abs(np.log(a / b)).max(axis=1))
-    if name == "sh":
-        a, b = (_colors(true["means"], sh, camera) for sh in (a, b))
-    return np.abs(a - b).reshape(len(a), -1).max(axis=1)
+    there = found["opacities"] > 0
+    found = {name: values[there] for name, values in found.items()}
+    true = {name: array.read()[rows[there]] for name, array in exact.arrays().items()}
+    away = np.linalg.norm(true["means"] - found["means"], axis=1)
+    lengths = np.linalg.norm(true["quats"], axis=1) * np.linalg.norm(found["quats"], axis=1)
+    cosine = np.abs((true["quats"] * found["quats"]).sum(axis=1)) / lengths
+    colors = (_colors(true["means"], each["sh"], camera) for each in (true, found))
+    differ = {
+        "lie off by more than half their size": away > 0.5 * np.median(true["scales"], axis=1),
+        "are turned by more than 0.1 rad": 2 * np.arccos(cosine.clip(0, 1)) > 0.1,
+        "have another size by more than a tenth": np.abs(np.log(true["scales"] / found["scales"])).max(axis=1) > 0.1,
+        "have another opacity by more than 0.05": np.abs(true["opacities"] - found["opacities"]) > 0.05,
+        "have another color by more than 0.05": np.abs(np.subtract(*colors)).max(axis=1) > 0.05,
+    }
+    counts = {what: int(which.sum()) for what, which in differ.items()}
+    reasons = [f"{n:,} of {scene.playback.count:,} Gaussians {what}" for what, n in counts.items() if n]
+    if exact.antialiased and not shown.antialiased:
+        reasons.append("the scene is drawn antialiased, which the file does not say")
+    return "; ".join(reasons)
 
 
 def _colors(means: Floats, sh: Floats, camera: Camera) -> Floats:
-    return sh if sh.ndim == 2 else np.maximum(seen(means, sh, camera) + CONSTANTS["SH_OFFSET"], 0)
-
-
-def seen(means: Floats, sh: Floats, camera: Camera) -> Floats:
-    """(N, 3) sums of harmonics (N, K, 3) in the directions from a camera."""
+    """(N, 3) displayed colors of harmonics (N, K, 3) in the directions from a camera."""
     towards = means - camera.position
     basis = sh_basis(towards / np.linalg.norm(towards, axis=1, keepdims=True), int(sh.shape[1] ** 0.5) - 1)
-    return np.asarray(np.einsum("nk,nkc->nc", basis, sh))
-
-
-def upload(device: Device, values: Floats) -> DeviceArray:
-    return DeviceArray.upload(device, "export loss", np.ascontiguousarray(values, np.float32))
+    return np.maximum(np.einsum("nk,nkc->nc", basis, sh) + CONSTANTS["SH_OFFSET"], 0)

@@ -13,16 +13,15 @@ from numpy.typing import NDArray
 from lapgs_wgpu.gpu.array import read_all
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.progress import counted
-from lapgs_wgpu.viewer.export_loss import Loss, measure, of_playback
+from lapgs_wgpu.viewer.export_loss import Loss, measure
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene, direction, nearest_axis
-from lapgs_wgpu.viewer.moving_files import SampledPlayback
+from lapgs_wgpu.viewer.moving_files import USD_HARMONICS, USD_KIND, SampledPlayback, load_pxr, read_usd
 from lapgs_wgpu.viewer.plain_opacity import plain_factors
-from lapgs_wgpu.viewer.usd_file import HARMONICS, KIND, load_pxr, read_usd
 
 Floats = NDArray[np.float32]
 _TYPES = {
     "positions": "Point3fArray", "orientations": "QuatfArray", "scales": "Float3Array", "opacities": "FloatArray",
-    HARMONICS: "Float3Array", "extent": "Float3Array",
+    USD_HARMONICS: "Float3Array", "extent": "Float3Array",
 }  # fmt: skip
 
 
@@ -46,7 +45,7 @@ def export_usd(scene: LoadedScene, file: Path, frames: int) -> Loss:
             made = packed
         with made.open("rb") as source:
             shutil.copyfileobj(source, target)
-    return measure(scene, of_playback(SampledPlayback(scene.playback.device, read_usd(file))))
+    return measure(scene, SampledPlayback(scene.playback.device, read_usd(file)))
 
 
 def _write(pxr: Any, stage: Any, scene: LoadedScene, frames: int) -> None:
@@ -61,11 +60,10 @@ def _write(pxr: Any, stage: Any, scene: LoadedScene, frames: int) -> None:
     stage.SetEndTimeCode(frames - 1)
     world = pxr.UsdGeom.Xform.Define(stage, "/World")
     stage.SetDefaultPrim(world.GetPrim())
-    turn = np.eye(4)
-    turn[:3, :3] = np.eye(3) if axis == "y" else _onto_z(direction(axis))
-    world.AddTransformOp().Set(pxr.Gf.Matrix4d(turn.T))  # USD multiplies rows
+    up, above = (pxr.Gf.Vec3d(*direction(name)) for name in (axis, "y" if axis == "y" else "z"))
+    world.AddTransformOp().Set(pxr.Gf.Matrix4d().SetRotate(pxr.Gf.Rotation(up, above)))
     _write_camera(pxr, stage, scene)
-    prim = stage.DefinePrim("/World/Splats", KIND)
+    prim = stage.DefinePrim("/World/Splats", USD_KIND)
     pxr.Usd.ColorSpaceAPI.Apply(prim).CreateColorSpaceNameAttr("srgb_rec709_display")
     types = pxr.Sdf.ValueTypeNames
     uniform = {"custom": False, "variability": pxr.Sdf.VariabilityUniform}
@@ -112,18 +110,9 @@ def _write_camera(pxr: Any, stage: Any, scene: LoadedScene) -> None:
     view = scene.camera().camera(640, 480)
     camera = pxr.UsdGeom.Camera.Define(stage, "/World/Camera")
     pose = np.linalg.inv(view.T_cam_world) @ np.diag([1.0, -1, -1, 1])  # USD's cameras look along -z, with y up
-    camera.AddTransformOp().Set(pxr.Gf.Matrix4d(pose.T))
+    camera.AddTransformOp().Set(pxr.Gf.Matrix4d(pose.T))  # USD multiplies rows
     camera.CreateFocalLengthAttr(50.0)
     camera.CreateHorizontalApertureAttr(50.0 * view.width / view.K[0, 0])
     camera.CreateVerticalApertureAttr(50.0 * view.height / view.K[1, 1])
     distance = scene.camera().distance
     camera.CreateClippingRangeAttr(pxr.Gf.Vec2f(0.01 * distance, 100 * distance))
-
-
-def _onto_z(up: NDArray[np.floating]) -> NDArray[np.floating]:
-    """(3, 3) the smallest rotation that takes an axis to z (Rodrigues)."""
-    x, y, z = up
-    if z < 0:
-        return np.diag([1.0, -1, -1])
-    cross = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0]])
-    return np.asarray(np.eye(3) + cross + cross @ cross / (1 + z))

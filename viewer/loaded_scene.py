@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.stamps import natural_key
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView
@@ -19,12 +18,10 @@ from lapgs_wgpu.io.safe_json_toml import read_toml
 from lapgs_wgpu.motion.playback.playback import Playback, playback_of
 from lapgs_wgpu.motion.scene_file import SceneFile, read_scene
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.viewer import moving_files
 from lapgs_wgpu.viewer.camera import ViewCamera
 from lapgs_wgpu.viewer.clock import Clock
-from lapgs_wgpu.viewer.options import USD
+from lapgs_wgpu.viewer.moving_files import MANIFEST, SampledPlayback, open_moving
 from lapgs_wgpu.viewer.render_modes import AHEAD, BACKGROUNDS
-from lapgs_wgpu.viewer.usd_file import read_usd
 from lapgs_wgpu.viewer.video import TimedCamera, orbit_views
 
 if TYPE_CHECKING:
@@ -103,12 +100,15 @@ def load_scene(
     are drawn; both otherwise as the file says.
     """
     playback: Playback
-    if path.is_dir() and not (path / moving_files.MANIFEST).is_file():
-        files = list(path.glob("*.ply"))
-        path = files[0] if len(files) == 1 else path
+    if path.is_dir():
+        stills = list(path.glob("*.ply"))
+        if (path / MANIFEST).is_file():
+            path = path / MANIFEST
+        elif len(stills) == 1:
+            path = stills[0]
     moving, file = open_moving(path), None
     if moving is not None:
-        playback, frames = moving_files.SampledPlayback(device(), moving, antialiased), moving.frames
+        playback, frames = SampledPlayback(device(), moving, antialiased), moving.frames
     else:
         file = read_scene(path)
         if antialiased is not None:
@@ -122,27 +122,11 @@ def load_scene(
     return LoadedScene(path, playback, initial_view._replace(frames=frames or initial_view.frames), file)
 
 
-def open_moving(path: Path) -> moving_files.MovingFile | None:
-    """Open a moving file of others; None where it is none. Raises InputError where it is damaged or needs a package."""
-    ending = path.suffix.lower()
-    if path.is_dir() and (path / moving_files.MANIFEST).is_file():
-        return moving_files.read_sequence(path / moving_files.MANIFEST)
-    if path.is_dir() and not (path / "checkpoint.ply").exists():
-        files = sorted(path.glob("*.ply"), key=lambda file: natural_key(file.name))
-        return moving_files.read_frames(files, {}) if len(files) > 1 else None
-    if ending == ".ply" and path.is_file():
-        return moving_files.read_spacetime_ply(path)
-    if ending in USD:
-        return read_usd(path)
-    read = {".json": moving_files.read_sequence, ".splatv": moving_files.read_splatv, ".4dgs": moving_files.read_4dgs}
-    return read[ending](path) if ending in read else None
-
-
 def guess_view(playback: Playback, axis: str | None = None) -> InitialView:
     """Guess a view of files that name no camera: the middle of the Gaussians, from where most of them are seen.
 
     axis: of AHEAD, up. Where it is not known, up is -y, as in scenes whose poses come from COLMAP; z where the
-    Gaussians lie flat in x and y, or move, as in D-NeRF's scenes.
+    Gaussians lie flat in x and y.
     """
     means = playback.at(0.0).means.read().astype(np.float64)
     if not len(means):
@@ -153,8 +137,6 @@ def guess_view(playback: Playback, axis: str | None = None) -> InitialView:
     flat = extent[2] < _FLAT * min(extent[0], extent[1])
     if axis in AHEAD:
         up, ahead = direction(axis), direction(AHEAD[axis])
-    elif playback.metadata.keys() - {"antialiased", "up", "offset", "fps"}:  # of a checkpoint
-        up, ahead = direction("z"), direction("y")
     elif flat:
         up, ahead = direction("z"), direction("-y")  # y points down in pictures
     else:

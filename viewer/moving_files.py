@@ -1,4 +1,4 @@
-"""Moving scenes in files of others: .ply sequences, Spacetime Gaussians (.ply, .splatv), .4dgs; and their playback."""
+"""Moving scenes in files of others (.ply sequences, Spacetime Gaussians, .splatv, .4dgs, OpenUSD), and their playback."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_wgpu.data.poses import world_to_camera
+from lapgs_wgpu.data.stamps import natural_key
 from lapgs_wgpu.errors import InputError, optional_module
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
@@ -27,11 +29,14 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.constants import CONSTANTS
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.linear_light import display_harmonics
+from lapgs_wgpu.viewer.options import USD
 
 Floats = NDArray[np.float32]
 MANIFEST = "sequence.json"
 SH_RANGE = 4.0  # of .4dgs: a coefficient is a byte from -this to +this (section 6.5 of the specification)
-LAST = 1 - 1e-6  # time in the clip of a .4dgs at which its last pieces are still there
+USD_KIND = "ParticleField3DGaussianSplat"
+USD_HARMONICS = "radiance:sphericalHarmonicsCoefficients"
+_LAST = 1 - 1e-6  # time in the clip of a .4dgs at which its last pieces are still there
 _SPLATV = 0x674B  # the first word of a .splatv
 AXES = ("x", "y", "z", "-x", "-y", "-z")  # as .4dgs numbers them
 _POLYNOMIAL = [
@@ -72,6 +77,18 @@ class SampledPlayback:
     def snapshot(self, t: float) -> GaussianSnapshot:
         now = self._sample(t)
         return GaussianSnapshot(now.means, now.sh, opacity_logits(now.opacities), np.log(now.scales), now.quats)
+
+
+def open_moving(path: Path) -> MovingFile | None:
+    """Open a moving file of others; None where it is none. Raises InputError where it is damaged or needs a package."""
+    if path.is_dir() and not (path / "checkpoint.ply").exists():
+        files = sorted(path.glob("*.ply"), key=lambda file: natural_key(file.name))
+        return read_frames(files, {}) if files else None
+    if path.suffix.lower() == ".ply":
+        return read_spacetime_ply(path)
+    readers = {".json": read_sequence, ".splatv": read_splatv, ".4dgs": read_4dgs} | dict.fromkeys(USD, read_usd)
+    reader = readers.get(path.suffix.lower())
+    return reader(path) if reader else None
 
 
 def read_sequence(path: Path) -> MovingFile:
@@ -140,18 +157,14 @@ def read_splatv(path: Path) -> MovingFile:
     magic, length = struct.unpack("<II", data[:8].ljust(8, b"\0"))
     if magic != _SPLATV or 8 + length > len(data):
         raise InputError(f"{path}: begins with {data[:4]!r} and has {len(data)} bytes; it is no whole .splatv.")
-    parts, at = parse_json(data[8 : 8 + length].decode(errors="replace"), str(path)), 8 + length
+    parts, begin = parse_json(data[8 : 8 + length].decode(errors="replace"), str(path)), 8 + length
     try:
-        for part in parts:
-            size = int(part["size"])
-            if part["type"] == "splat" and size % 64 == 0 and 0 < size <= len(data) - at:
-                words = np.frombuffer(data[at : at + size], "<u4").reshape(-1, 16)
-                break
-            at += size
-        else:
-            raise ValueError("no part `splat` lies whole in the file")
-        view = _view(part.get("cameras") or [])
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        sizes = [int(part["size"]) for part in parts]
+        number = [part["type"] for part in parts].index("splat")
+        words = np.frombuffer(data, "<u4", sizes[number] // 4, begin + sum(sizes[:number])).reshape(-1, 16)
+        cameras = parts[number].get("cameras")
+        view = {"view": _view(cameras[0]).to_json()} if cameras else {}
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise InputError(f"{path}: its parts cannot be read ({type(error).__name__}: {error}).") from None
     words = words[words[:, 7] >> 24 > 0]  # rows that pad the texture are invisible
     halves = words.view("<f2").astype(np.float32)
@@ -166,16 +179,13 @@ def read_splatv(path: Path) -> MovingFile:
     )  # fmt: skip
 
 
-def _view(cameras: list[Any]) -> dict[str, str]:
-    """The first camera of a list as in Inria's cameras.json, as metadata."""
-    for camera in cameras:
-        R, position = np.array(camera["rotation"], float), np.array(camera["position"], float)  # camera to world
-        fx, fy, width, height = (float(camera[name]) for name in ("fx", "fy", "width", "height"))
-        K, T = np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]]), np.eye(4)
-        T[:3, :3], T[:3, 3] = R.T, -R.T @ position
-        view = InitialView(Camera(K, T, int(width), int(height)), position + 4 * R[:, 2], -R[:, 1], 150)
-        return {"view": view.to_json()}
-    return {}
+def _view(camera: dict[str, Any]) -> InitialView:
+    """Where a viewer begins: a camera as in Inria's cameras.json, whose rotation is from camera to world."""
+    R, position = np.array(camera["rotation"], float), np.array(camera["position"], float)
+    fx, fy, width, height = (float(camera[name]) for name in ("fx", "fy", "width", "height"))
+    K = np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])
+    start = Camera(K, world_to_camera(R, position), int(width), int(height))
+    return InitialView(start, position + 4 * R[:, 2], -R[:, 1], 150)
 
 
 def _polynomial(
@@ -207,11 +217,15 @@ def read_4dgs(path: Path) -> MovingFile:
     g, seconds = scene.gaussians, scene.duration_sec
     if not len(g.positions):
         raise InputError(f"{path}: holds 0 Gaussians; at least 1 is needed")
-    sh = display_harmonics(harmonics_4dgs(g)).astype(np.float32)
+    light = g.colors[:, None, :3] / CONSTANTS["SH_C0"]  # harmonics (N, K, 3) of linear light, without offset
+    if g.sh_degree:
+        others = g.sh.reshape(len(light), 3, -1).transpose(0, 2, 1) * (2 * SH_RANGE / 255) - SH_RANGE
+        light = np.concatenate([light, others], axis=1)
+    sh = display_harmonics(light).astype(np.float32)
     quats, scales = np.roll(g.rotations, 1, axis=1).astype(np.float32), g.scales.astype(np.float32)  # xyzw to wxyz
 
     def sample(t: float) -> Gaussians[Floats]:
-        now = g.state_at(min(t, LAST) * seconds)
+        now = g.state_at(min(t, _LAST) * seconds)
         means, opacities = g.positions.astype(np.float32), np.zeros(len(quats), np.float32)
         means[now["indices"]], opacities[now["indices"]] = now["centers"], now["opacity"]
         return Gaussians(means, quats, scales, opacities, sh)
@@ -222,13 +236,47 @@ def read_4dgs(path: Path) -> MovingFile:
     return MovingFile(sample, max(2, round(30 * seconds) + 1), metadata)
 
 
-def harmonics_4dgs(gaussians: Any) -> NDArray[np.floating]:
-    """Return the harmonics (N, K, 3) of linear light, without offset, of the library's Gaussians."""
-    light: NDArray[np.floating] = gaussians.colors[:, None, :3] / CONSTANTS["SH_C0"]
-    if gaussians.sh_degree:
-        others = gaussians.sh.reshape(len(light), 3, -1).transpose(0, 2, 1) * (2 * SH_RANGE / 255) - SH_RANGE
-        light = np.concatenate([light, others], axis=1)
-    return light
+def read_usd(path: Path) -> MovingFile:
+    """Read the first Gaussian splat of a stage, in its own coordinates. Raises InputError."""
+    pxr = load_pxr()
+    try:
+        stage = pxr.Usd.Stage.Open(str(path))
+    except pxr.Tf.ErrorException as error:
+        raise InputError(f"{path}: usd-core cannot open it ({str(error).splitlines()[0][:200]}).") from None
+    prim = next((prim for prim in stage.Traverse() if prim.GetTypeName() == USD_KIND), None)
+    if prim is None:
+        raise InputError(f"{path}: holds no prim of the type {USD_KIND} (OpenUSD 26.03); other splats are not read.")
+    start, end = stage.GetStartTimeCode(), stage.GetEndTimeCode()
+    degree = int(prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get() or 0)
+
+    def get(name: str, code: float) -> Floats:
+        values = prim.GetAttribute(name).Get(code)
+        if values is None:
+            values = prim.GetAttribute(f"{name}h").Get(code)  # in half precision
+        return np.array(values if values is not None else [], np.float32)
+
+    count = len(get("positions", start))
+    shapes = {"positions": (count, 3), "orientations": (count, 4), "scales": (count, 3), "opacities": (count,)}
+    shapes[USD_HARMONICS] = (count * (degree + 1) ** 2, 3)
+
+    def sample(t: float, stage: Any = stage) -> Gaussians[Floats]:  # without its stage a prim is empty
+        found = {name: get(name, start + t * (end - start)) for name in shapes}
+        for name, shape in shapes.items():
+            if found[name].shape != shape or not count or not np.isfinite(found[name]).all():
+                raise InputError(f"{path}: {name} has shape {found[name].shape}, not finite {shape}.")
+        means, quats, scales, opacities, sh = found.values()
+        return Gaussians(means, np.roll(quats, 1, axis=1), scales, opacities, sh.reshape(count, -1, 3))
+
+    data = dict(stage.GetRootLayer().customLayerData)
+    metadata = {"fps": str(stage.GetTimeCodesPerSecond())} | {k: str(v) for k, v in data.items() if k == "view"}
+    return MovingFile(sample, max(1, round(end - start) + 1), metadata)
+
+
+def load_pxr() -> Any:
+    """Import usd-core. Raises InputError where it is missing."""
+    for name in ("Gf", "Sdf", "Tf", "Usd", "UsdGeom", "UsdUtils", "Vt"):
+        optional_module(f"pxr.{name}", "OpenUSD files need usd-core", "usd")
+    return optional_module("pxr", "OpenUSD files need usd-core", "usd")
 
 
 def _finite(values: Floats, path: Path) -> Floats:
