@@ -13,7 +13,7 @@ from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.viewer.frame import Frame, FrameRequest
-from lapgs_wgpu.viewer.present import HEAT, Offscreen
+from lapgs_wgpu.viewer.present import HEAT, Presenter
 from lapgs_wgpu.viewer.render_modes import Mode
 
 pytestmark = [pytest.mark.kernels, pytest.mark.triangles]
@@ -29,14 +29,14 @@ class Bench:
 
     planes: Floats
     uploaded: DeviceArray
-    offscreen: Offscreen
+    presenter: Presenter
 
     def show(
         self, mode: Mode = "rgb", size: tuple[int, int] = (WIDTH, HEIGHT), low: float = 0.0, high: float = 1.0
     ) -> Floats:
         """(H, W, 3) as presented, in [0, 1]."""
         request = FrameRequest(Camera(np.eye(3), np.eye(4), WIDTH, HEIGHT), 0.0, mode, BACKGROUND)
-        return self.offscreen(size, Frame(request, self.uploaded, low, high)) / 255.0
+        return self.presenter.picture(size, Frame(request, self.uploaded, low, high)) / 255.0
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def bench(device: Device) -> Bench:
     planes[3, 0, :3] = 1.0  # nothing there
     planes[:3, 0, :3] = planes[4, 0, :3] = 0.0
     planes[4] *= 4 * (1 - planes[3])
-    return Bench(planes.astype(np.float64), DeviceArray.upload(device, "planes", planes), Offscreen(device))
+    return Bench(planes.astype(np.float64), DeviceArray.upload(device, "planes", planes), Presenter(device))
 
 
 def near(got: Floats, expected: Floats) -> None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lapgs_wgpu.data.poses import world_to_camera
-from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.camera import Camera, rotation_matrix
 
 Vector = NDArray[np.float64]
 _STEEPEST = math.radians(89)  # of the line of sight, up or down: beyond it the picture would turn over
@@ -25,7 +26,7 @@ class ViewCamera:
         """Start where a camera stands; the focus is moved onto its line of sight."""
         self.position: Vector = camera.position
         self.focus: Vector = np.asarray(focus, np.float64)
-        self.up: Vector = _unit(np.asarray(up, np.float64))
+        self.up: Vector = np.asarray(up, np.float64) / np.linalg.norm(up)
         self.near = camera.near
         self.stand_at(camera)
         self._start = (self.position, self.focus, self.rotation, self.fov_y)
@@ -64,9 +65,11 @@ class ViewCamera:
         self.position = self.focus + factor * (self.position - self.focus)
 
     def focus_on(self, point: ArrayLike) -> None:
-        """Turn about another point from now on, which moves to the middle of the picture."""
-        self.focus = np.asarray(point, np.float64)
-        self.rotation = self._level(self.focus - self.position)
+        """Turn about another point from now on, which moves to the middle of the picture, the horizon level."""
+        point = np.asarray(point, np.float64)
+        with suppress(ValueError):  # where the camera stands, or straight above or below it
+            seen = Camera.looking_at(self.position, point, up=self.up, fov_x=1.0, width=1, height=1)
+            self.focus, self.rotation = point, seen.T_cam_world[:3, :3]
 
     def camera(self, width: int, height: int) -> Camera:
         """Make the rasterizer's camera for a picture of this size."""
@@ -79,27 +82,13 @@ class ViewCamera:
         horizon stays as level, or as rolled, as it was."""
         turned = self.rotation @ _about(self.up, right)
         across = np.cross(turned[2], self.up)
-        across = _unit(across) if np.linalg.norm(across) > 1e-6 else turned[0]
+        length = np.linalg.norm(across)
+        across = across / length if length > 1e-6 else turned[0]
         pitch = math.asin(float(np.clip(turned[2] @ self.up, -1, 1)))
         new = float(np.clip(pitch - down, -_STEEPEST, _STEEPEST))
         self.rotation = turned @ _about(across, pitch - new)
 
-    def _level(self, forward: Vector) -> NDArray[np.float64]:
-        """(3, 3) rotation from world to camera of a line of sight, the horizon level."""
-        forward = _unit(forward) if np.linalg.norm(forward) > 0 else np.array([0.0, 0.0, 1.0])
-        right = np.cross(forward, self.up)
-        if np.linalg.norm(right) < 1e-6:  # straight up or down: any direction is to the right
-            right = np.cross(forward, np.roll(self.up, 1))
-        right = _unit(right)
-        return np.stack([right, np.cross(forward, right), forward])
-
-
-def _unit(v: Vector) -> Vector:
-    return v / np.linalg.norm(v)
-
 
 def _about(axis: Vector, angle: float) -> NDArray[np.float64]:
-    """(3, 3) rotation by an angle about a unit axis, right-handed (Rodrigues)."""
-    x, y, z = axis
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+    """(3, 3) rotation by an angle about a unit axis, right-handed."""
+    return rotation_matrix([math.cos(0.5 * angle), *(math.sin(0.5 * angle) * axis)])

@@ -45,6 +45,8 @@ def _view(arguments: list[str]) -> None:
 
         antialiased = None if given.antialiased is None else given.antialiased == "yes"
         scene = load_scene(Path(given.file), device.result, up=given.up, antialiased=antialiased)
+    if given.mode == "motion" and not scene.playback.moves:
+        raise InputError(f"{scene.path}: does not move; --mode motion shows nothing.")
     show(scene)
 
 
@@ -72,12 +74,8 @@ def _window(given: Any) -> Callable[[LoadedScene], None]:
 
 
 def _start(given: Any, state: ViewState) -> None:
-    """Set the state as the options say. Raises InputError where the scene lacks the mode or the view."""
-    from lapgs_wgpu.viewer.offscreen import check_mode
-
-    if given.mode is not None:
-        check_mode(state.scene, state.renderer, given.mode)
-        state.mode = given.mode
+    """Set the state as the options say. Raises InputError where the capture lacks the view."""
+    state.mode = given.mode or state.mode
     if given.view is not None:
         name = state.scene.view(given.view).name
         state.stand_at([view.name for view in state.views].index(name))
@@ -87,7 +85,9 @@ def _start(given: Any, state: ViewState) -> None:
     if given.time is not None:
         clock.seek(given.time)
     clock.fps, clock.speed = given.fps or clock.fps, given.speed or clock.speed
-    clock.loop, clock.playing = given.loop or clock.loop, bool(given.play)
+    clock.loop = given.loop or clock.loop
+    if given.play:
+        clock.toggle()
 
 
 def _renderer(given: Any, scene: LoadedScene) -> OffscreenRenderer:

@@ -42,8 +42,8 @@ class Clock:
         self.time = min(max(time, 0.0), 1.0)
 
     def toggle(self) -> None:
-        """Play or pause; at the end of a clip that plays once, from the start."""
-        self.playing = not self.playing
+        """Play or pause; at the end of a clip that plays once, from the start. What has one frame does not play."""
+        self.playing = not self.playing and self.frames > 1
         if self.playing and self.loop == "once" and self.time >= 1.0:
             self.time = 0.0
 
@@ -51,6 +51,15 @@ class Clock:
         """Pause, and go some frames on or back."""
         self.playing = False
         self.seek((self.frame + frames) / max(1, self.frames - 1))
+
+    def slower(self) -> None:
+        self.speed = max((speed for speed in SPEEDS if speed < self.speed), default=SPEEDS[0])
+
+    def faster(self) -> None:
+        self.speed = min((speed for speed in SPEEDS if speed > self.speed), default=SPEEDS[-1])
+
+    def next_loop(self) -> None:
+        self.loop = LOOPS[(LOOPS.index(self.loop) + 1) % len(LOOPS)]
 
     def advance(self, seconds: float) -> None:
         """Let that much of the viewer's time pass."""

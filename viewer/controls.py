@@ -13,32 +13,34 @@ from lapgs_wgpu.viewer.viewport import Viewport
 class KeyBinding(NamedTuple):
     """A key and what it does.
 
-    key: as the canvas names it. shown: in the help. action: a method or a flag of ViewState, or focus (of Viewport).
+    key: as the canvas names it. shown: in the help. action: its name in web pages; without `do`, focus, or the flag of
+    ViewState that it turns.
     """
 
     key: str
     shown: str
     action: str
     help: str
+    do: Callable[[ViewState], None] | None = None
 
 
 KEYS = (
-    KeyBinding(" ", "Space", "toggle_playing", "play or pause"),
-    KeyBinding(",", ",", "previous_frame", "a frame back"),
-    KeyBinding(".", ".", "next_frame", "a frame on"),
-    KeyBinding("Home", "Home", "first_frame", "to the start"),
-    KeyBinding("End", "End", "last_frame", "to the end"),
-    KeyBinding("[", "[", "slower", "play slower"),
-    KeyBinding("]", "]", "faster", "play faster"),
-    KeyBinding("l", "L", "next_loop", "at the end: loop, bounce or stop"),
-    KeyBinding("m", "M", "next_mode", "what is shown: colors, depth, coverage, motion"),
-    KeyBinding("b", "B", "next_background", "background: black, white or grey"),
+    KeyBinding(" ", "Space", "toggle_playing", "play or pause", lambda state: state.clock.toggle()),
+    KeyBinding(",", ",", "previous_frame", "a frame back", lambda state: state.clock.step(-1)),
+    KeyBinding(".", ".", "next_frame", "a frame on", lambda state: state.clock.step(1)),
+    KeyBinding("Home", "Home", "first_frame", "to the start", lambda state: state.clock.seek(0.0)),
+    KeyBinding("End", "End", "last_frame", "to the end", lambda state: state.clock.seek(1.0)),
+    KeyBinding("[", "[", "slower", "play slower", lambda state: state.clock.slower()),
+    KeyBinding("]", "]", "faster", "play faster", lambda state: state.clock.faster()),
+    KeyBinding("l", "L", "next_loop", "at the end: loop, bounce or stop", lambda state: state.clock.next_loop()),
+    KeyBinding("m", "M", "next_mode", "what is shown: colors, depth, coverage, motion", ViewState.next_mode),
+    KeyBinding("b", "B", "next_background", "background: black, white or grey", ViewState.next_background),
     KeyBinding("x", "X", "antialiased", "antialiased or not (Mip-Splatting's filter)"),
     KeyBinding("f", "F", "focus", "turn about what lies under the pointer (a double click does the same)"),
-    KeyBinding("r", "R", "reset_camera", "camera back to where it started"),
-    KeyBinding("n", "N", "next_view", "stand at the capture's next camera, at its time"),
-    KeyBinding("p", "P", "toggle_pause", "pause a training that is watched, or let it go on"),
-    KeyBinding("s", "S", "step_training", "one step of a training, then pause"),
+    KeyBinding("r", "R", "reset_camera", "camera back to where it started", lambda state: state.camera.reset()),
+    KeyBinding("n", "N", "next_view", "stand at the capture's next camera, at its time", ViewState.next_view),
+    KeyBinding("p", "P", "toggle_pause", "pause a training that is watched, or let it go on", ViewState.toggle_pause),
+    KeyBinding("s", "S", "step_training", "one step of a training, then pause", ViewState.step_training),
     KeyBinding("o", "O", "show_overlay", "frames a second, milliseconds, splats, adapter"),
     KeyBinding("t", "T", "show_transport", "the time slider"),
     KeyBinding("h", "H", "show_panels", "all panels"),
@@ -50,7 +52,7 @@ MOUSE = (
     ("wheel", "nearer or farther"),
     ("double click", "turn about what lies there"),
 )
-_ACTIONS = {key.key: key.action for key in KEYS} | {"/": "show_help"}  # where "?" is told as "/" with Shift
+_BY_KEY = {key.key: key for key in KEYS} | {"/": KEYS[-1]}  # where "?" is told as "/" with Shift
 ORBIT = 0.008  # radians a pixel of dragging
 ZOOM = 0.0015  # of the distance's logarithm a pixel of the wheel
 
@@ -65,57 +67,44 @@ class Controls:
         self, state: ViewState, viewport: Viewport, *, covered: Callable[[float, float], bool], wake: Callable[[], None]
     ) -> None:
         self.state, self.viewport = state, viewport
-        self._covered, self._wake = covered, wake
+        self._covered = covered
         self.pointer = (0.0, 0.0)
         self._dragging: str | None = None
         listen = viewport.canvas.add_event_handler
-        listen(self._on_pointer_down, "pointer_down")
-        listen(self._on_pointer_move, "pointer_move")
-        listen(self._on_pointer_up, "pointer_up")
-        listen(self._on_double_click, "double_click")
-        listen(self._on_wheel, "wheel")
+        pointer = ("pointer_down", "pointer_move", "pointer_up", "double_click", "wheel")
+        listen(self._on_pointer, *pointer)
         listen(self._on_key_down, "key_down")
         # Panels react to everything, so everything asks for a draw; what has not changed is only presented again.
-        everything = ("pointer_down", "pointer_move", "pointer_up", "wheel", "key_down", "key_up", "char", "resize")
-        listen(lambda event: wake(), *everything, order=-100)
+        listen(lambda event: wake(), *pointer, "key_down", "key_up", "char", "resize", order=-100)
 
     def _on_key_down(self, event: dict[str, Any]) -> None:
-        key = event["key"].lower() if len(event["key"]) == 1 else event["key"]  # letters without Shift
-        action = _ACTIONS.get(key) if "Control" not in event["modifiers"] else None
-        if action == "focus":
+        name = event["key"].lower() if len(event["key"]) == 1 else event["key"]  # letters without Shift
+        key = _BY_KEY.get(name) if "Control" not in event["modifiers"] else None
+        if key is None:
+            return
+        if key.action == "focus":
             self.viewport.focus(*self.pointer)
-        elif action:
-            value = getattr(self.state, action)
-            if callable(value):
-                value()
-            else:
-                setattr(self.state, action, not value)
+        elif key.do is not None:
+            key.do(self.state)
+        else:
+            setattr(self.state, key.action, not getattr(self.state, key.action))
 
-    def _on_pointer_down(self, event: dict[str, Any]) -> None:
-        self.pointer = (event["x"], event["y"])
-        if not self._covered(*self.pointer):
-            self._dragging = "pan" if event["button"] != 1 or "Shift" in event["modifiers"] else "orbit"
-
-    def _on_pointer_move(self, event: dict[str, Any]) -> None:
-        state, (x, y) = self.state, (event["x"], event["y"])
-        right, down = x - self.pointer[0], y - self.pointer[1]
+    def _on_pointer(self, event: dict[str, Any]) -> None:
+        (x, y), last = (event["x"], event["y"]), self.pointer
         self.pointer = (x, y)
-        if self._dragging == "orbit":
-            state.camera.orbit(ORBIT * right, ORBIT * down)
-        elif self._dragging == "pan":
+        kind, camera = event["event_type"], self.state.camera
+        if kind == "pointer_up":
+            self._dragging = None
+        elif kind == "pointer_move" and self._dragging == "orbit":
+            camera.orbit(ORBIT * (x - last[0]), ORBIT * (y - last[1]))
+        elif kind == "pointer_move" and self._dragging == "pan":
             height = self.viewport.canvas.get_logical_size()[1]
-            state.camera.pan(right / height, down / height)
-
-    def _on_pointer_up(self, event: dict[str, Any]) -> None:
-        self._dragging = None
-
-    def _on_double_click(self, event: dict[str, Any]) -> None:
-        self.pointer = (event["x"], event["y"])
-        if not self._covered(*self.pointer):
-            self.viewport.focus(*self.pointer)
-            self._wake()
-
-    def _on_wheel(self, event: dict[str, Any]) -> None:
-        self.pointer = (event["x"], event["y"])
-        if not self._covered(*self.pointer):
-            self.state.camera.zoom(math.exp(ZOOM * event["dy"]))
+            camera.pan((x - last[0]) / height, (y - last[1]) / height)
+        elif kind == "pointer_move" or self._covered(x, y):
+            return
+        elif kind == "pointer_down":
+            self._dragging = "pan" if event["button"] != 1 or "Shift" in event["modifiers"] else "orbit"
+        elif kind == "double_click":
+            self.viewport.focus(x, y)
+        else:
+            camera.zoom(math.exp(ZOOM * event["dy"]))

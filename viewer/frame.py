@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lapgs_wgpu.gpu.array import DeviceArray, read_all
+from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.playback.playback import Playback
@@ -51,8 +51,7 @@ def warm_up(device: Device) -> None:
     shapes = ((1, 3), (1, 4), (1, 3), (1,), (1, 16, 3))
     one = Gaussians(*(DeviceArray.upload(device, "one Gaussian", np.ones(shape, np.float32)) for shape in shapes))
     camera = Camera.looking_at([1, 1, -3], [1, 1, 1], up=[0, -1, 0], fov_x=0.7, width=16, height=16)
-    rasterizer = Rasterizer(device)
-    rasterizer.grow_on_overflow(rasterizer.draw(one, camera))
+    Rasterizer(device).draw_whole(one, camera)
 
 
 class FrameRenderer:
@@ -86,14 +85,11 @@ class FrameRenderer:
             colors, high = value
             gaussians = dataclasses.replace(gaussians, sh=colors)
             background = (0.0, 0.0, 0.0)
-        while True:
-            drawing = self._rasterizer.draw(gaussians, camera, background, depth=mode == "depth")
-            visible, *needed = read_all([drawing.lists.visible, *drawing.needed])
-            if not self._rasterizer.grow_on_overflow(drawing, needed):
-                break
+        drawing = self._rasterizer.draw_whole(gaussians, camera, background, depth=mode == "depth")
+        splats = int(drawing.lists.visible.read()[0])
         if mode == "depth":
             low, high = self._depth_range(drawing.image)
-        return Frame(request, drawing.image, low, high, time.perf_counter() - start, int(visible[0]))
+        return Frame(request, drawing.image, low, high, time.perf_counter() - start, splats)
 
     def depth_at(self, frame: Frame, column: int, row: int) -> float | None:
         """Measure the depth along the camera's axis at a pixel, world units; None where it shows next to nothing."""

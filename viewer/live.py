@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 from rendercanvas.utils.asyncs import sleep
 
@@ -22,7 +23,7 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.viewer import window
 from lapgs_wgpu.viewer.app import App
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
-from lapgs_wgpu.viewer.view_state import TrainingControl, TrainingStep
+from lapgs_wgpu.viewer.view_state import TrainingControl
 
 SHARE = 0.02  # of the time may go into pictures while nobody moves anything
 _OPENING = 4.0  # seconds after the first step, in which the window draws what it begins with: shaders are compiled
@@ -30,11 +31,10 @@ _ATTENTION = 0.5  # seconds after a move in which the pictures come first
 _PATIENCE = 0.02  # seconds between looks at mouse and keys while the training rests
 
 
-def watch(path: Path, scene: Scene4D, initial_view: InitialView, steps: Iterator[TrainingStep]) -> None:
+def watch(path: Path, scene: Scene4D, initial_view: InitialView, steps: Iterator[Any]) -> None:
     """Show the scene in a window and take the training's steps, until the window is closed.
 
-    path: of the checkpoint, once there is one.
-
+    path: of the checkpoint, once there is one. steps: each takes one and returns its StepResult.
     An error of a step closes the window and goes on to the caller.
     """
     canvas, loop = window.make_canvas("training - lapgs-train", (1280, 720))

@@ -1,4 +1,4 @@
-"""Moving scenes in files of others (.ply sequences, Spacetime Gaussians, .splatv, .4dgs, OpenUSD), and their playback."""
+"""Moving scenes in files of others, and their playback: .ply sequences, Spacetime Gaussians, .splatv, .4dgs, OpenUSD."""
 
 from __future__ import annotations
 

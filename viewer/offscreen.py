@@ -5,36 +5,26 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.viewer.frame import FrameRenderer, FrameRequest
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
-from lapgs_wgpu.viewer.present import Offscreen
+from lapgs_wgpu.viewer.present import Presenter
 from lapgs_wgpu.viewer.render_modes import Mode
 
 Color = tuple[float, float, float]
 
 
 class OffscreenRenderer:
-    """Renders images of a scene. Raises InputError where the scene has nothing to show in this mode."""
+    """Renders images of a scene."""
 
     def __init__(self, scene: LoadedScene, mode: Mode = "rgb", background: Color | None = None) -> None:
-        self._renderer = FrameRenderer(scene.playback)
-        check_mode(scene, self._renderer, mode)
-        self._offscreen = Offscreen(scene.playback.device)
-        self._mode = mode
-        self._background = scene.background if background is None else background
+        self._renderer, self._presenter = FrameRenderer(scene.playback), Presenter(scene.playback.device)
+        self._mode, self._background = mode, scene.background if background is None else background
 
     def __call__(self, camera: Camera, time: float) -> NDArray[np.uint8]:
         """Draw what the camera sees at a time in [0, 1]: (height, width, 3) uint8."""
         frame = self._renderer.draw(FrameRequest(camera, time, self._mode, self._background))
-        return self._offscreen((camera.width, camera.height), frame)
-
-
-def check_mode(scene: LoadedScene, renderer: FrameRenderer, mode: Mode) -> None:
-    """Raises InputError where the scene has nothing to show in this mode."""
-    if mode not in renderer.modes():
-        raise InputError(f"{scene.path}: has nothing to show in mode {mode}; it has {', '.join(renderer.modes())}.")
+        return self._presenter.picture((camera.width, camera.height), frame)
 
 
 def framed(camera: Camera, width: int, height: int) -> Camera:

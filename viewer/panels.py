@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, TypeVar
 
 from imgui_bundle import imgui
@@ -101,7 +102,7 @@ class Panels:
         _, state.antialiased = imgui.checkbox("antialiased", state.antialiased)
         _tip("Mip-Splatting's filter, as antialiased trainings draw (X)")
         if _button("Reset"):
-            state.reset_camera()
+            state.camera.reset()
         _tip("camera back to where it started (R)")
         imgui.same_line()
         if _button("Help"):
@@ -111,7 +112,7 @@ class Panels:
             self._training(state.training)
         if state.views:
             chosen = _choice("camera", state.view, range(len(state.views)), [view.name for view in state.views])
-            if chosen is not None and chosen != state.view:
+            if chosen != state.view:
                 state.stand_at(chosen)
         self._end()
 
@@ -180,11 +181,11 @@ def _time_slider(state: ViewState) -> None:
         clock.playing = False
         clock.seek(time)
     for text, width, action in (
-        ("|<", 32, state.first_frame),
-        ("<", 32, state.previous_frame),
-        ("Pause" if clock.playing else "Play", 64, state.toggle_playing),
-        (">", 32, state.next_frame),
-        (">|", 32, state.last_frame),
+        ("|<", 32, partial(clock.seek, 0.0)),
+        ("<", 32, partial(clock.step, -1)),
+        ("Pause" if clock.playing else "Play", 64, clock.toggle),
+        (">", 32, partial(clock.step, 1)),
+        (">|", 32, partial(clock.seek, 1.0)),
     ):
         if _button(text, width):
             action()

@@ -24,14 +24,13 @@ HEAT = (
     (0.99, 0.99, 0.80),
 )
 _NUMBERS: dict[Mode, int] = {"rgb": 0, "alpha": 1, "depth": 2, "motion": 3}  # of the modes in the shader
-OFFSCREEN_FORMAT = "rgba8unorm"
 
 
 class Presenter:
     """Draws frames onto textures of one format of one device."""
 
-    def __init__(self, device: Device, target_format: str) -> None:
-        self.device = device
+    def __init__(self, device: Device, target_format: str = "rgba8unorm") -> None:
+        self.device, self._format = device, target_format
         self._pool = BufferPool(device)
         self._source = compose("present", {})
         native = device.wgpu_device
@@ -69,26 +68,11 @@ class Presenter:
         render.end()
         self.device.queue.submit([encoder.finish()])
 
-
-class Offscreen:
-    """Presents onto a texture of its own and reads it back."""
-
-    def __init__(self, device: Device) -> None:
-        self._presenter = Presenter(device, OFFSCREEN_FORMAT)
-        self._texture: Any = None
-        self._device = device
-
-    def __call__(self, size: tuple[int, int], frame: Frame) -> NDArray[np.uint8]:
-        """Draw a frame on a target of (width, height); returns (height, width, 3) uint8."""
-        native = self._device.wgpu_device
-        if self._texture is None or self._texture.size[:2] != size:
-            usage = wgpu.TextureUsage.RENDER_ATTACHMENT | wgpu.TextureUsage.COPY_SRC
-            self._texture = native.create_texture(size=(*size, 1), format=OFFSCREEN_FORMAT, usage=usage)
-        self._presenter(self._texture.create_view(), size, frame)
-        width, height = size
-        pitch = (4 * width + 255) // 256 * 256
-        data = self._device.queue.read_texture(
-            {"texture": self._texture}, {"bytes_per_row": pitch, "rows_per_image": height}, (*size, 1)
-        )
-        rows = np.frombuffer(data, np.uint8).reshape(height, pitch)
-        return rows[:, : 4 * width].reshape(height, width, 4)[..., :3].copy()
+    def picture(self, size: tuple[int, int], frame: Frame) -> NDArray[np.uint8]:
+        """Draw a frame on a texture of (width, height), by default rgba8unorm; returns (height, width, 3) uint8."""
+        usage = wgpu.TextureUsage.RENDER_ATTACHMENT | wgpu.TextureUsage.COPY_SRC
+        texture = self.device.wgpu_device.create_texture(size=(*size, 1), format=self._format, usage=usage)
+        self(texture.create_view(), size, frame)
+        layout = {"bytes_per_row": 4 * size[0], "rows_per_image": size[1]}
+        data = self.device.queue.read_texture({"texture": texture}, layout, (*size, 1))
+        return np.frombuffer(data, np.uint8).reshape(size[1], size[0], 4)[..., :3].copy()

@@ -1,12 +1,11 @@
-"""What the viewer shows: scene, camera, time, mode. Its methods are the actions of keys and panels."""
+"""What the viewer shows: scene, camera, time, mode. Its methods are actions of keys and panels."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
-from lapgs_wgpu.viewer.clock import LOOPS, SPEEDS
 from lapgs_wgpu.viewer.frame import FrameRenderer
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 from lapgs_wgpu.viewer.render_modes import BACKGROUNDS, Mode
@@ -15,22 +14,12 @@ if TYPE_CHECKING:
     from lapgs_wgpu.data import View
 
 
-class TrainingStep(Protocol):
-    """A finished step: its number, the total number of steps, and the PSNR in dB of its view."""
-
-    @property
-    def step(self) -> int: ...
-    @property
-    def steps(self) -> int: ...
-    @property
-    def psnr(self) -> float: ...
-
-
 @dataclass
 class TrainingControl:
-    """Pauses a training. last: the last finished step. single: steps that still run although the training is paused."""
+    """Pauses a training. last: the last finished step, a StepResult. single: steps that still run although it is
+    paused."""
 
-    last: TrainingStep | None = None
+    last: Any = None
     paused: bool = False
     single: int = 0
 
@@ -39,7 +28,7 @@ class ViewState:
     """Panels read and set the attributes; keys call the methods and turn the flags (viewer/controls). Knows no
     window and no GUI.
 
-    view: number of the capture's camera that was chosen last, or None. training: the training under way; None where a
+    view: number of the capture's camera that was chosen last, -1 before. training: the training under way; None where a
     file is shown.
     """
 
@@ -53,7 +42,7 @@ class ViewState:
         self.background = scene.background
         self.antialiased = scene.playback.at(0.0).antialiased
         self.show_transport = scene.playback.moves
-        self.view: int | None = None
+        self.view = -1
 
     @cached_property
     def views(self) -> tuple[View, ...]:
@@ -67,45 +56,15 @@ class ViewState:
         self.clock.playing = False
         self.clock.seek(self.views[view].time)
 
-    # Actions of keys (viewer/controls), which also turn the flags ------------------------------------------------
-
-    def toggle_playing(self) -> None:
-        if self.scene.playback.moves:
-            self.clock.toggle()
-
-    def previous_frame(self) -> None:
-        self.clock.step(-1)
-
-    def next_frame(self) -> None:
-        self.clock.step(1)
-
-    def first_frame(self) -> None:
-        self.clock.seek(0.0)
-
-    def last_frame(self) -> None:
-        self.clock.seek(1.0)
-
-    def slower(self) -> None:
-        self.clock.speed = max((s for s in SPEEDS if s < self.clock.speed), default=SPEEDS[0])
-
-    def faster(self) -> None:
-        self.clock.speed = min((s for s in SPEEDS if s > self.clock.speed), default=SPEEDS[-1])
-
-    def next_loop(self) -> None:
-        self.clock.loop = _next(LOOPS, self.clock.loop)
-
     def next_mode(self) -> None:
         self.mode = _next(self.renderer.modes(), self.mode)
 
     def next_background(self) -> None:
         self.background = _next(list(BACKGROUNDS.values()), self.background)
 
-    def reset_camera(self) -> None:
-        self.camera.reset()
-
     def next_view(self) -> None:
         if self.views:
-            self.stand_at((self.view + 1 if self.view is not None else 0) % len(self.views))
+            self.stand_at((self.view + 1) % len(self.views))
 
     def toggle_pause(self) -> None:
         if self.training is not None:
