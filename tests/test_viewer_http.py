@@ -27,7 +27,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.viewer import cli
 from lapgs_wgpu.viewer.loaded_scene import load_scene
 from lapgs_wgpu.viewer.offscreen import OffscreenRenderer
-from lapgs_wgpu.viewer.remote import guarded, open_entry
+from lapgs_wgpu.viewer.remote import RemoteCanvas, guarded, listen, welcome
 
 TOKEN = "a-token_of-22-letters"
 SIZE = (480, 320)
@@ -62,18 +62,17 @@ def test_who_does_not_know_the_token_gets_nothing(kind: str) -> None:
 def test_where_it_listens() -> None:
     for package in ("uvicorn", "websockets", "imgui_bundle"):
         pytest.importorskip(package)
-    entry, other = open_entry("127.0.0.1", 0), open_entry("0.0.0.0", 0)
-    with entry.listening, other.listening:
-        assert entry.listening.getsockname()[0] == "127.0.0.1"
-        assert f"http://localhost:{entry.port}/{entry.token}/ " in entry.welcome("a.ply")
-        assert f"ssh -L {entry.port}:localhost:{entry.port} USER@THIS_MACHINE" in entry.welcome("a.ply")
-        assert len(entry.token) > 20
-        assert entry.token != other.token
-        with pytest.raises(InputError, match=f"port {entry.port}"):
-            open_entry("127.0.0.1", entry.port)
+    with listen("127.0.0.1", 0) as listening:
+        host, port = listening.getsockname()
+        assert host == "127.0.0.1"
+        told = welcome("a.ply", host, port, TOKEN)
+        assert f"http://localhost:{port}/{TOKEN}/ " in told
+        assert f"ssh -L {port}:localhost:{port} USER@THIS_MACHINE" in told
+        with pytest.raises(InputError, match=f"port {port}"):
+            listen("127.0.0.1", port)
     for host in ("192.0.2.1", "no.such.name.example"):
         with pytest.raises(InputError, match="--host"):
-            open_entry(host, 0)
+            listen(host, 0)
 
 
 def test_a_missing_library_of_the_system_is_named(
@@ -93,8 +92,6 @@ def test_a_missing_library_of_the_system_is_named(
 def sent(device: Device, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Any, list[tuple[int, str, int]]]]:
     """A canvas that its first browser has just connected to, and who was sent what: browser, kind, number."""
     http = pytest.importorskip("rendercanvas.http")
-    from lapgs_wgpu.viewer.remote_canvas import RemoteCanvas
-
     log: list[tuple[int, str, int]] = []
 
     def note(message: dict[str, Any], buffers: list[bytes], id: int) -> None:

@@ -63,10 +63,11 @@ def _window(given: Any) -> Callable[[LoadedScene], None]:
     """Start listening for browsers, or check that a window can be opened; returns what shows a scene there."""
     start = partial(_start, given)
     if given.backend == "http":
-        from lapgs_wgpu.viewer.remote import open_entry, run_remote
+        from lapgs_wgpu.viewer.remote import listen, run_remote
 
-        entry = open_entry(given.host or "127.0.0.1", 8080 if given.port is None else given.port)
-        return lambda scene: run_remote(scene, entry, start)
+        host = given.host or "127.0.0.1"
+        listening = listen(host, 8080 if given.port is None else given.port)
+        return lambda scene: run_remote(scene, listening, host, start)
     from lapgs_wgpu.viewer.window import check_window, run_window
 
     check_window(_WITHOUT_WINDOW)

@@ -1,4 +1,4 @@
-"""Moving scenes in files of others, and their playback: .ply sequences, Spacetime Gaussians, .splatv, .4dgs, OpenUSD."""
+"""Moving scenes in files of others, played: .ply sequences, Spacetime Gaussians (.ply, .splatv), .4dgs, OpenUSD."""
 
 from __future__ import annotations
 

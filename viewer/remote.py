@@ -9,15 +9,17 @@ from __future__ import annotations
 import asyncio
 import errno
 import html
-import importlib.util
 import secrets
 import socket
 import sys
 from collections.abc import Awaitable, Callable, MutableMapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
-from lapgs_wgpu.errors import InputError, pip_install
+from rendercanvas.http import HttpRenderCanvas, asgi, loop, resources
+
+from lapgs_wgpu.errors import InputError, optional_module
+from lapgs_wgpu.viewer.app import App
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 from lapgs_wgpu.viewer.view_state import ViewState
 from lapgs_wgpu.viewer.web_page import web_file
@@ -32,68 +34,45 @@ _LOCAL = ("localhost", "127.0.0.1", "::1")
 _EVERYWHERE = ("0.0.0.0", "::")
 
 
-class Entry(NamedTuple):
-    """Where the server listens. host: as given. token: with which all addresses begin."""
-
-    listening: socket.socket
-    host: str
-    token: str
-
-    @property
-    def port(self) -> int:
-        return int(self.listening.getsockname()[1])
-
-    def welcome(self, file: str) -> str:
-        """Say which address to open, here and on another machine."""
-        name = end = f"[{self.host}]" if ":" in self.host else self.host
-        if self.host in _LOCAL:
-            name = end = "localhost"
-        if self.host in _EVERYWHERE:
-            name, end = socket.gethostname(), "localhost"
-        port, place = self.port, f"{self.port}/{self.token}/"
-        lines = [
-            f"lapgs-view: {file} is shown at http://{name}:{place} until Ctrl-C.",
-            f"From another machine: ssh -L {port}:{end}:{port} USER@THIS_MACHINE, then open "
-            f"http://localhost:{place} there.",
-        ]
-        if self.host not in _LOCAL:
-            lines.append("Pictures and token go over the network as they are; through the tunnel they are encrypted.")
-        return "\n".join(lines)
-
-
-def open_entry(host: str, port: int) -> Entry:
+def listen(host: str, port: int) -> socket.socket:
     """Listen. Raises InputError where that is not possible, or a package is missing."""
-    missing = [name for name in ("uvicorn", "websockets", "imgui_bundle") if importlib.util.find_spec(name) is None]
-    if missing:
-        raise InputError(f"--backend http needs {', '.join(missing)}: {pip_install('remote')}.")
+    for name in ("uvicorn", "websockets"):
+        optional_module(name, f"--backend http needs {name}", "remote")
     check_imgui()
     address = "127.0.0.1" if host == "localhost" else host
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
     try:
-        return Entry(socket.create_server((address, port), family=family), host, secrets.token_urlsafe(24))
+        return socket.create_server((address, port), family=family)
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
             raise InputError(f"port {port} is in use; name another with --port, 0 for any that is free.") from None
         raise InputError(f"--host {host} --port {port} cannot be listened on: {error.strerror}.") from None
 
 
-def run_remote(scene: LoadedScene, entry: Entry, start: Callable[[ViewState], None]) -> None:
+def welcome(file: str, host: str, port: int, token: str) -> str:
+    """Say which address to open, here and on another machine. host: as given."""
+    end = "localhost" if host in _LOCAL + _EVERYWHERE else f"[{host}]" if ":" in host else host
+    name, place = socket.gethostname() if host in _EVERYWHERE else end, f"{port}/{token}/"
+    text = f"""lapgs-view: {file} is shown at http://{name}:{place} until Ctrl-C.
+From another machine: ssh -L {port}:{end}:{port} USER@THIS_MACHINE, then open http://localhost:{place} there."""
+    if host in _LOCAL:
+        return text
+    return f"{text}\nPictures and token go over the network as they are; through the tunnel they are encrypted."
+
+
+def run_remote(scene: LoadedScene, listening: socket.socket, host: str, start: Callable[[ViewState], None]) -> None:
     """Show it to browsers until Ctrl-C, which raises KeyboardInterrupt. start: as for run_window."""
     import uvicorn
-    from rendercanvas.http import asgi, loop, resources
-
-    from lapgs_wgpu.viewer.app import App
-    from lapgs_wgpu.viewer.remote_canvas import RemoteCanvas
 
     # The page is rendercanvas's, whose scripts it uses, but its canvas fills the window.
     # rendercanvas takes Ctrl-C from uvicorn when its loop starts, closes the canvas and leaves the server running.
     loop._BaseLoop__setup_interrupt_hooks = dict
-    name = scene.path.name
+    name, token = scene.path.name, secrets.token_urlsafe(24)
     resources["index.html"] = "text/html", web_file("remote.html").replace("{{title}}", html.escape(name))
     app = App(RemoteCanvas(title=name, update_mode="ondemand", max_fps=60), loop, scene)
     start(app.state)
     config = uvicorn.Config(
-        guarded(asgi, entry.token),
+        guarded(asgi, token),
         log_level="warning",
         access_log=False,  # it would show the token
         server_header=False,
@@ -105,10 +84,10 @@ def run_remote(scene: LoadedScene, entry: Entry, start: Callable[[ViewState], No
         ws_ping_timeout=30,
         timeout_graceful_shutdown=2,
     )
-    print(entry.welcome(str(scene.path)), file=sys.stderr, flush=True)
+    print(welcome(str(scene.path), host, listening.getsockname()[1], token), file=sys.stderr, flush=True)
     server = uvicorn.Server(config)
     app.end = partial(setattr, server, "should_exit", True)
-    asyncio.run(server.serve(sockets=[entry.listening]))
+    asyncio.run(server.serve(sockets=[listening]))
     if app.failed is not None:
         raise app.failed
     raise KeyboardInterrupt  # nothing else ends the server, but on a busy machine it may come to end without a word
@@ -128,3 +107,33 @@ def guarded(app: Application, token: str) -> Application:
             await send({"type": "http.response.body", "body": b"Open the address that lapgs-view printed.\n"})
 
     return serve
+
+
+class RemoteCanvas(HttpRenderCanvas):
+    """rendercanvas's canvas for browsers, which is experimental, with corrections.
+
+    Pictures go out as JPEG while something moves, and once more as PNG when nothing has for 0.3 seconds.
+
+    The first browser that is connected drives, the others watch.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        self._sizes: dict[int, dict[str, Any]] = {}  # last resize event of each browser
+        super().__init__(**options)
+
+    def _on_event(self, event: dict[str, Any], id: int) -> None:
+        driver, kind = self._active_client, event.get("type")
+        if kind == "close":  # upstream closes the canvas for everybody
+            return
+        if kind == "resize":
+            self._sizes[id] = dict(event)
+        super()._on_event(event, id)
+        if self._active_client != driver and self._active_client in self._sizes:  # another one, with another window
+            super()._on_event(dict(self._sizes[self._active_client]), self._active_client)
+
+    def _maybe_draw(self) -> None:
+        """Also sends a picture later that could not be sent when it was made, since two were on their way: often it is
+        the lossless one. Upstream does so only for several browsers."""
+        super()._maybe_draw()
+        if self._last_frame[0] is not None:
+            self._send_last_frame_to_ready_clients()
