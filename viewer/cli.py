@@ -15,7 +15,9 @@ from lapgs_wgpu.viewer.options import USD, parse_options
 from lapgs_wgpu.viewer.render_modes import BACKGROUNDS
 
 if TYPE_CHECKING:
+    from lapgs_wgpu.data import View
     from lapgs_wgpu.gpu.device import Device
+    from lapgs_wgpu.splat.camera import Camera
     from lapgs_wgpu.viewer.loaded_scene import LoadedScene
     from lapgs_wgpu.viewer.offscreen import OffscreenRenderer
     from lapgs_wgpu.viewer.view_state import ViewState
@@ -97,22 +99,28 @@ def _renderer(given: Any, scene: LoadedScene) -> OffscreenRenderer:
     return OffscreenRenderer(scene, given.mode or "rgb", BACKGROUNDS.get(given.background))
 
 
+def _place(given: Any, scene: LoadedScene) -> tuple[View | None, tuple[int, int], float]:
+    """The captured view that --view names, and the picture's size and time: as given, otherwise of that view."""
+    view = scene.view(given.view) if given.view is not None else None
+    size = given.size or ((view.camera.width, view.camera.height) if view else _SIZE)
+    return view, size, given.time if given.time is not None else view.time if view else 0.0
+
+
+def _camera(scene: LoadedScene, view: View | None, size: tuple[int, int]) -> Camera:
+    from lapgs_wgpu.viewer.offscreen import framed
+
+    return framed(view.camera, *size) if view else scene.camera().camera(*size)
+
+
 def _screenshot(given: Any, scene: LoadedScene) -> None:
     from lapgs_wgpu.data.images import encode_png
     from lapgs_wgpu.io.atomic import atomic_write
-    from lapgs_wgpu.viewer.offscreen import framed
 
     file = _named(given.screenshot, ".png", "--screenshot")
-    time = given.time or 0.0
-    if given.view is not None:
-        view = scene.view(given.view)
-        camera = framed(view.camera, *given.size) if given.size else view.camera
-        time = view.time if given.time is None else given.time
-    else:
-        camera = scene.camera().camera(*(given.size or _SIZE))
+    view, size, time = _place(given, scene)
     with atomic_write(file) as target:
-        target.write(encode_png(_renderer(given, scene)(camera, time)))
-    print(f"{file}: {camera.width}x{camera.height}, time {time:g}")
+        target.write(encode_png(_renderer(given, scene)(_camera(scene, view, size), time)))
+    print(f"{file}: {size[0]}x{size[1]}, time {time:g}")
 
 
 def _video(given: Any, scene: LoadedScene) -> None:
@@ -121,33 +129,24 @@ def _video(given: Any, scene: LoadedScene) -> None:
     from lapgs_wgpu.data.images import size_text
     from lapgs_wgpu.viewer import video
     from lapgs_wgpu.viewer.camera import ViewCamera
-    from lapgs_wgpu.viewer.offscreen import framed
 
     file = _named(given.video, ".mp4", "--video")
     path = given.path or ("time" if scene.playback.moves else "view")
     if path != "view" and given.time is not None:
         raise InputError(f"--time has no use with --path {path}, along which time passes.")
-    view = scene.view(given.view) if given.view is not None else None
-
-    fps = given.fps or 30.0
-    seconds = 6.0 if path == "view" else scene.clock().frames / fps
-    wanted = given.size or ((view.camera.width, view.camera.height) if view else _SIZE)
+    view, wanted, time = _place(given, scene)
     size = video.even(wanted)
     if size != wanted:
         print(f"note: mp4 needs even sizes: {size_text(wanted)} becomes {size_text(size)}", file=sys.stderr)
-    frames = video.count_frames(given.seconds or seconds, fps)
-
+    fps = given.fps or 30.0
+    frames = video.count_frames(given.seconds or (6.0 if path == "view" else scene.clock().frames / fps), fps)
     if path == "time":
-        camera = framed(view.camera, *size) if view else scene.camera().camera(*size)
+        camera = _camera(scene, view, size)
         cameras: Iterator[video.TimedCamera] = ((camera, share) for share in np.linspace(0, 1, frames).tolist())
     else:
-        start, arc, time = scene.camera(), scene.initial_view.arc, 0.0
-        if view is not None:
-            start = ViewCamera(view.camera, scene.initial_view.focus, scene.initial_view.up)
-            arc, time = scene.initial_view.arc_from(view.camera), view.time
-        if given.time is not None:
-            time = given.time
-        cameras = video.orbit_views(start, size, frames, None if path == "both" else time, arc)
+        first, start = scene.initial_view, view.camera if view else scene.initial_view.camera
+        turning = ViewCamera(start, first.focus, first.up)
+        cameras = video.orbit_views(turning, size, frames, None if path == "both" else time, first.arc_from(start))
     video.write_video(file, cameras, frames, fps, _renderer(given, scene))
     print(f"{file}: {frames} frames of {size_text(size)} at {fps:g} a second")
 
@@ -182,13 +181,6 @@ def _export(given: Any, scene: LoadedScene) -> None:
     print(f"{file}: {line}{size}, {loss.psnr:.1f} dB PSNR against {scene.path}")
     if loss.reason:
         print(f"warning: the loss is seen: {loss.reason}.", file=sys.stderr)
-    # Our own formats say whether the scene is antialiased; for .4dgs and OpenUSD opacities are fitted to plain drawing.
-    if ending not in (".4dgs", ".lapgs", ".html", *USD) and scene.playback.at(0.0).antialiased:
-        print(
-            "note: the scene was trained antialiased, which the comment 'SplatRenderMode: mip' tells few viewers: "
-            "where they offer antialiased drawing, turn it on; elsewhere thin places look a little thicker.",
-            file=sys.stderr,
-        )
 
 
 _JOBS = {"screenshot": _screenshot, "video": _video, "export": _export}

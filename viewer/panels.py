@@ -26,18 +26,11 @@ _ACCENT = (0.95, 0.60, 0.25, 1.0)
 
 
 class _Renderer(ImguiRenderer):
-    """Keeps keys from the viewer only while text is typed: after a click on a panel, imgui would
-    otherwise hold on to them. And a button goes down where its event says: a finger is there without a move."""
+    """A button goes down where its event says: a finger is there without a move."""
 
     def _on_mouse(self, event: dict[str, Any]) -> None:
         self.backend.io.add_mouse_pos_event(event["x"], event["y"])
         super()._on_mouse(event)
-
-    def _on_key(self, event: dict[str, Any]) -> None:
-        passed_on = dict(event)
-        super()._on_key(passed_on)
-        if self.backend.io.want_text_input:
-            event["stop_propagation"] = True
 
 
 class Panels:
