@@ -236,7 +236,6 @@ MISTAKES = {
     "a jpeg": (["CHECKPOINT", "--screenshot", "a.jpg"], "ends with .png"),
     "a folder without frames": (["CHECKPOINT", "--export", "a"], "--frames"),
     "an unknown view": (["CHECKPOINT", "--screenshot", "a.png", "--view", "99"], "--view 99"),
-    "too long": (["CHECKPOINT", "--video", "a.mp4", "--fps", "1000", "--seconds", "86400"], "are 86400000 frames"),
     "a missing folder": (["CHECKPOINT", "--screenshot", "no/a.png", "--size", "8x8"], "no/a.png"),
     "frames in a file": (["CHECKPOINT", "--export", "used", "--frames", "2"], "used"),
 }
@@ -270,5 +269,5 @@ def test_the_capture_opens_as_the_training_opened_it(
     )
     (tmp_path / "config.toml").write_text(f'[data]\npath = "{tmp_path}"\nsize = 200\nmovers = "masks"\n{line}\n')
     scene = SimpleNamespace(path=tmp_path / "checkpoint.ply", playback=SimpleNamespace(metadata={}))
-    assert LoadedScene.views(scene) == ("a", "b")  # type: ignore[arg-type]
+    assert LoadedScene.views.func(scene) == ("a", "b")
     assert opened == [{"image_size": 200, "undistort": expected, "movers": "masks"}]

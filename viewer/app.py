@@ -19,7 +19,7 @@ _LONGEST_STEP = 0.25  # seconds that the clip goes on at once, after the window 
 class App:
     """A viewer on a rendercanvas and its event loop.
 
-    drawing_seconds: spent on drawing so far, GUI included. failed: what ended it, if the device did. end: called then.
+    drawing_seconds: that the last draw took, GUI included. failed: what ended it, if the device did. end: called then.
     """
 
     def __init__(self, canvas: Any, loop: Any, scene: LoadedScene) -> None:
@@ -61,7 +61,7 @@ class App:
             self.canvas.request_draw()
         elif not self.viewport.at_rest:
             self.loop.call_later(SETTLED, self.canvas.request_draw)
-        self.drawing_seconds += time.perf_counter() - now
+        self.drawing_seconds = time.perf_counter() - now
 
     def _wake(self) -> None:
         self._gui_draws = _GUI_DRAWS

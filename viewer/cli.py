@@ -80,8 +80,7 @@ def _start(given: Any, state: ViewState) -> None:
     """Set the state as the options say. Raises InputError where the capture lacks the view."""
     state.mode = given.mode or state.mode
     if given.view is not None:
-        name = state.scene.view(given.view).name
-        state.stand_at([view.name for view in state.views].index(name))
+        state.stand_at(state.scene.view_number(given.view))
     state.background = BACKGROUNDS.get(given.background, state.background)
     state.show_transport = bool(given.time_slider or state.show_transport)
     clock = state.clock
@@ -101,7 +100,7 @@ def _renderer(given: Any, scene: LoadedScene) -> OffscreenRenderer:
 
 def _place(given: Any, scene: LoadedScene) -> tuple[View | None, tuple[int, int], float]:
     """The captured view that --view names, and the picture's size and time: as given, otherwise of that view."""
-    view = scene.view(given.view) if given.view is not None else None
+    view = scene.views[scene.view_number(given.view)] if given.view is not None else None
     size = given.size or ((view.camera.width, view.camera.height) if view else _SIZE)
     return view, size, given.time if given.time is not None else view.time if view else 0.0
 
@@ -139,7 +138,8 @@ def _video(given: Any, scene: LoadedScene) -> None:
     if size != wanted:
         print(f"note: mp4 needs even sizes: {size_text(wanted)} becomes {size_text(size)}", file=sys.stderr)
     fps = given.fps or 30.0
-    frames = video.count_frames(given.seconds or (6.0 if path == "view" else scene.clock().frames / fps), fps)
+    seconds = given.seconds or (6.0 if path == "view" else scene.clock().frames / fps)
+    frames = max(1, round(seconds * fps))
     if path == "time":
         camera = _camera(scene, view, size)
         cameras: Iterator[video.TimedCamera] = ((camera, share) for share in np.linspace(0, 1, frames).tolist())

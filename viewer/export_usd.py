@@ -15,14 +15,10 @@ from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.progress import counted
 from lapgs_wgpu.viewer.export_loss import Loss, measure
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene, direction, nearest_axis
-from lapgs_wgpu.viewer.moving_files import USD_HARMONICS, USD_KIND, SampledPlayback, load_pxr, read_usd
+from lapgs_wgpu.viewer.moving_files import SampledPlayback, load_pxr, read_usd
 from lapgs_wgpu.viewer.plain_opacity import plain_factors
 
 Floats = NDArray[np.float32]
-_TYPES = {
-    "positions": "Point3fArray", "orientations": "QuatfArray", "scales": "Float3Array", "opacities": "FloatArray",
-    USD_HARMONICS: "Float3Array", "extent": "Float3Array",
-}  # fmt: skip
 
 
 def export_usd(scene: LoadedScene, file: Path, frames: int) -> Loss:
@@ -63,44 +59,50 @@ def _write(pxr: Any, stage: Any, scene: LoadedScene, frames: int) -> None:
     up, above = (pxr.Gf.Vec3d(*direction(name)) for name in (axis, "y" if axis == "y" else "z"))
     world.AddTransformOp().Set(pxr.Gf.Matrix4d().SetRotate(pxr.Gf.Rotation(up, above)))
     _write_camera(pxr, stage, scene)
-    prim = stage.DefinePrim("/World/Splats", USD_KIND)
-    pxr.Usd.ColorSpaceAPI.Apply(prim).CreateColorSpaceNameAttr("srgb_rec709_display")
-    types = pxr.Sdf.ValueTypeNames
-    uniform = {"custom": False, "variability": pxr.Sdf.VariabilityUniform}
-    prim.CreateAttribute("radiance:sphericalHarmonicsDegree", types.Int, **uniform).Set(
-        scene.playback.at(0.0).sh_degree
-    )
-    attributes = {name: prim.CreateAttribute(name, getattr(types, kind), custom=False) for name, kind in _TYPES.items()}
+    splats = pxr.UsdVol.ParticleField3DGaussianSplat.Define(stage, "/World/Splats")
+    pxr.Usd.ColorSpaceAPI.Apply(splats.GetPrim()).CreateColorSpaceNameAttr("srgb_rec709_display")
+    splats.CreateRadianceSphericalHarmonicsDegreeAttr(scene.playback.at(0.0).sh_degree)
+    attributes = {
+        "positions": splats.CreatePositionsAttr(),
+        "orientations": splats.CreateOrientationsAttr(),
+        "scales": splats.CreateScalesAttr(),
+        "opacities": splats.CreateOpacitiesAttr(),
+        "harmonics": splats.CreateRadianceSphericalHarmonicsCoefficientsAttr(),
+        "extent": splats.CreateExtentAttr(),
+    }
     factors = plain_factors(scene).astype(np.float32)
-    last: dict[str, tuple[int, Floats]] = {}  # what was written, and for which frame
+    last: dict[str, Floats] = {}  # what was written
     for number, t in enumerate(counted(np.linspace(0, 1, frames).tolist(), frames, "frames")):
         for name, values in _values(scene, t, factors).items():
-            if name == "orientations" and name in last:  # -q turns as q does, but not what lies between frames
-                values[(values * last[name][1]).sum(axis=1) < 0] *= -1
-            if name in last and np.array_equal(values, last[name][1]):
-                continue
-            if name in last and last[name][0] < number - 1:
-                attributes[name].Set(_vt(pxr, name, last[name][1]), number - 1)
-            value = _vt(pxr, name, values)
             if name not in last:
-                attributes[name].Set(value)  # for programs that ask for no time
-            attributes[name].Set(value, number)
-            last[name] = number, values
+                attributes[name].Set(_vt(pxr, values))  # for programs that ask for no time
+            else:
+                if name == "orientations":  # -q turns as q does, but not what lies between frames
+                    values[(values * last[name]).sum(axis=1) < 0] *= -1
+                if np.array_equal(values, last[name]):
+                    continue
+                attributes[name].Set(_vt(pxr, last[name]), number - 1)  # until then it stood still
+            attributes[name].Set(_vt(pxr, values), number)
+            last[name] = values
 
 
 def _values(scene: LoadedScene, t: float, factors: Floats) -> dict[str, Floats]:
     """The attributes' values at a time. factors: (N,) of the opacities."""
     now = scene.playback.at(t)
     means, quats, scales, opacities, sh = read_all([now.means, now.quats, now.scales, now.opacities, now.sh])
-    quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
     reach = 3 * scales.max(axis=1, keepdims=True)
-    extent = np.stack([(means - reach).min(axis=0), (means + reach).max(axis=0)])
-    arrays = (means, quats, scales, factors * opacities, sh.reshape(-1, 3), extent)
-    return dict(zip(_TYPES, arrays, strict=True))
+    return {
+        "positions": means,
+        "orientations": quats / np.linalg.norm(quats, axis=1, keepdims=True),
+        "scales": scales,
+        "opacities": factors * opacities,
+        "harmonics": sh.reshape(-1, 3),
+        "extent": np.stack([(means - reach).min(axis=0), (means + reach).max(axis=0)]),
+    }
 
 
-def _vt(pxr: Any, name: str, values: Floats) -> Any:
-    if name == "orientations":  # in memory the real part is last
+def _vt(pxr: Any, values: Floats) -> Any:
+    if values.shape[-1] == 4 and values.ndim == 2:  # quaternions, whose real part is last in memory
         return pxr.Vt.QuatfArray.FromNumpy(np.ascontiguousarray(np.roll(values, -1, axis=1)))
     kind = pxr.Vt.FloatArray if values.ndim == 1 else pxr.Vt.Vec3fArray
     return kind.FromNumpy(np.ascontiguousarray(values))

@@ -26,7 +26,6 @@ from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 from lapgs_wgpu.viewer.view_state import TrainingControl
 
 SHARE = 0.02  # of the time may go into pictures while nobody moves anything
-_OPENING = 4.0  # seconds after the first step, in which the window draws what it begins with: shaders are compiled
 _ATTENTION = 0.5  # seconds after a move in which the pictures come first
 _PATIENCE = 0.02  # seconds between looks at mouse and keys while the training rests
 
@@ -51,8 +50,7 @@ def watch(path: Path, scene: Scene4D, initial_view: InitialView, steps: Iterator
 
     async def drive() -> None:
         signal.signal(signal.SIGINT, on_interrupt)  # in place of the one of the window's loop
-        begun: float | None = None
-        pictured = spent = 0.0  # when the last picture was asked for, and the time that had gone into drawing then
+        pictured = 0.0  # when the last picture was asked for
         while True:
             moving = not state.clock.playing and time.perf_counter() - viewport.moved_at < _ATTENTION
             if moving or (training.paused and not training.single):
@@ -69,12 +67,9 @@ def watch(path: Path, scene: Scene4D, initial_view: InitialView, steps: Iterator
             training.last = progress
             training.single = max(0, training.single - 1)
             now = time.perf_counter()
-            begun = begun or now
-            if now - begun < _OPENING:
-                pictured, spent = now, app.drawing_seconds
-            if training.paused or (not viewport.stale and now - pictured > (app.drawing_seconds - spent) / SHARE):
+            if training.paused or (not viewport.stale and now - pictured > app.drawing_seconds / SHARE):
                 viewport.refresh()
-                pictured, spent = now, app.drawing_seconds
+                pictured = now
             await sleep(0.0)
 
     loop.add_task(drive)

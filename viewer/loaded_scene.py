@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Iterator
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +33,8 @@ _FLAT = 0.5  # of the extents along x and y: what is lower lies on the ground
 _FRAMES = 150  # of a clip whose file does not say how many it has
 
 
-class LoadedScene(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class LoadedScene:
     """path: where it came from; of a training under way, its checkpoint. initial_view: camera, focus, up and frames to
     begin with. file: its content, None for a training, and for moving files of others."""
 
@@ -55,6 +57,7 @@ class LoadedScene(NamedTuple):
         fps = float(self.playback.metadata.get("fps", 30))
         return Clock(self.initial_view.frames if self.playback.moves else 1, fps=fps)
 
+    @cached_property
     def views(self) -> tuple[View, ...]:
         """The views of the capture that the config.toml beside a checkpoint names, those held out first; none where the
         scene is of no run, or the capture is not here."""
@@ -72,17 +75,16 @@ class LoadedScene(NamedTuple):
             return ()
         return (*dataset.test, *dataset.train)
 
-    def view(self, wanted: str) -> View:
-        """The view of the capture with this name, or number in the order of `views`. Raises InputError."""
-        views = self.views()
-        if not views:
+    def view_number(self, wanted: str) -> int:
+        """The number in `views` of the one with this name or number. Raises InputError."""
+        names = [view.name for view in self.views]
+        if not names:
             raise InputError(
                 f"--view {wanted}: beside {self.path} is no config.toml that names a capture which is here."
             )
-        by_name = {str(number): view for number, view in enumerate(views)} | {view.name: view for view in views}
-        if wanted not in by_name:
-            raise InputError(f"--view {wanted}: views are 0 to {len(views) - 1}, {views[0].name} to {views[-1].name}.")
-        return by_name[wanted]
+        if wanted not in names and wanted not in map(str, range(len(names))):
+            raise InputError(f"--view {wanted}: views are 0 to {len(names) - 1}, {names[0]} to {names[-1]}.")
+        return names.index(wanted) if wanted in names else int(wanted)
 
     @property
     def background(self) -> tuple[float, float, float]:
@@ -135,12 +137,9 @@ def guess_view(playback: Playback, axis: str | None = None) -> InitialView:
     radius = max(float(np.quantile(np.linalg.norm(means - middle, axis=1), 0.9)), 1e-3)
     extent = np.subtract(*np.quantile(means, [0.9, 0.1], axis=0))
     flat = extent[2] < _FLAT * min(extent[0], extent[1])
-    if axis in AHEAD:
-        up, ahead = direction(axis), direction(AHEAD[axis])
-    elif flat:
-        up, ahead = direction("z"), direction("-y")  # y points down in pictures
-    else:
-        up, ahead = direction("-y"), direction("z")
+    if axis not in AHEAD:
+        axis = "z" if flat else "-y"
+    up, ahead = direction(axis), direction(AHEAD[axis])
     away = math.sin(_ELEVATION) * up - math.cos(_ELEVATION) * ahead
     camera = Camera.looking_at(middle + 3.6 * radius * away, middle, up=up.tolist(), fov_x=0.9, width=640, height=480)
     return InitialView(camera, middle, up, _FRAMES)

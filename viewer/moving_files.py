@@ -34,8 +34,7 @@ from lapgs_wgpu.viewer.options import USD
 Floats = NDArray[np.float32]
 MANIFEST = "sequence.json"
 SH_RANGE = 4.0  # of .4dgs: a coefficient is a byte from -this to +this (section 6.5 of the specification)
-USD_KIND = "ParticleField3DGaussianSplat"
-USD_HARMONICS = "radiance:sphericalHarmonicsCoefficients"
+_USD_KIND = "ParticleField3DGaussianSplat"
 _LAST = 1 - 1e-6  # time in the clip of a .4dgs at which its last pieces are still there
 _SPLATV = 0x674B  # the first word of a .splatv
 AXES = ("x", "y", "z", "-x", "-y", "-z")  # as .4dgs numbers them
@@ -139,7 +138,7 @@ def read_spacetime_ply(path: Path) -> MovingFile | None:
         vertex = ply.elements.get("vertex")
         if vertex is None or not set(_POLYNOMIAL) <= vertex.properties.keys():
             return None
-        values = _finite(ply.columns(vertex, _POLYNOMIAL), path)
+        values = ply.columns(vertex, _POLYNOMIAL)
         decoded = "f_dc_3" in vertex.properties
     means, motion, quats, omega, scales, opacity, colors, time = np.split(values, [3, 12, 16, 20, 23, 24, 27], axis=1)
     if decoded:  # features: the first three are the color that the network beside the file adds to
@@ -148,7 +147,8 @@ def read_spacetime_ply(path: Path) -> MovingFile | None:
         )
         colors = _sigmoid(colors)
     scales, width = np.exp(scales), np.exp(time[:, 1])
-    return _polynomial(means, motion, quats, omega, scales, _sigmoid(opacity[:, 0]), colors, time[:, 0], width, {})
+    opacities = _sigmoid(opacity[:, 0])
+    return _polynomial(path, means, motion, quats, omega, scales, opacities, colors, time[:, 0], width, {})
 
 
 def read_splatv(path: Path) -> MovingFile:
@@ -169,13 +169,9 @@ def read_splatv(path: Path) -> MovingFile:
     words = words[words[:, 7] >> 24 > 0]  # rows that pad the texture are invisible
     halves = words.view("<f2").astype(np.float32)
     rgba = (words[:, 7:8].copy().view(np.uint8) / 255).astype(np.float32)
-    means = words[:, :3].copy().view("<f4")
-    if not len(words):
-        raise InputError(f"{path}: holds no Gaussians that can be seen.")
-    _finite(np.concatenate([means, halves[:, 6:13], halves[:, 16:25], halves[:, 26:32]], axis=1), path)
     return _polynomial(
-        means, halves[:, 16:25], halves[:, 6:10], halves[:, 26:30], halves[:, 10:13], rgba[:, 3], rgba[:, :3],
-        halves[:, 30], halves[:, 31], view,
+        path, words[:, :3].copy().view("<f4"), halves[:, 16:25], halves[:, 6:10], halves[:, 26:30], halves[:, 10:13],
+        rgba[:, 3], rgba[:, :3], halves[:, 30], halves[:, 31], view,
     )  # fmt: skip
 
 
@@ -189,10 +185,14 @@ def _view(camera: dict[str, Any]) -> InitialView:
 
 
 def _polynomial(
-    means: Floats, motion: Floats, quats: Floats, omega: Floats, scales: Floats, opacities: Floats, colors: Floats,
-    center: Floats, width: Floats, metadata: dict[str, str],
+    path: Path, means: Floats, motion: Floats, quats: Floats, omega: Floats, scales: Floats, opacities: Floats,
+    colors: Floats, center: Floats, width: Floats, metadata: dict[str, str],
 ) -> MovingFile:  # fmt: skip
     """motion: (N, 9) by the powers of time since `center`. omega: (N, 4) change of quats a clip. width: of the bell."""
+    values = np.column_stack([means, motion, quats, omega, scales, opacities, colors, center, width])
+    bad = int((~np.isfinite(values).all(axis=1)).sum())
+    if bad or not len(values):
+        raise InputError(f"{path}: {bad} of its {len(values)} visible Gaussians hold NaN or infinity; export it again.")
     sh = ((colors - np.float32(0.5)) / np.float32(CONSTANTS["SH_C0"]))[:, None]
     scales = np.maximum(scales, np.float32(1e-7))
 
@@ -243,9 +243,9 @@ def read_usd(path: Path) -> MovingFile:
         stage = pxr.Usd.Stage.Open(str(path))
     except pxr.Tf.ErrorException as error:
         raise InputError(f"{path}: usd-core cannot open it ({str(error).splitlines()[0][:200]}).") from None
-    prim = next((prim for prim in stage.Traverse() if prim.GetTypeName() == USD_KIND), None)
+    prim = next((prim for prim in stage.Traverse() if prim.GetTypeName() == _USD_KIND), None)
     if prim is None:
-        raise InputError(f"{path}: holds no prim of the type {USD_KIND} (OpenUSD 26.03); other splats are not read.")
+        raise InputError(f"{path}: holds no prim of the type {_USD_KIND} (OpenUSD 26.03); other splats are not read.")
     start, end = stage.GetStartTimeCode(), stage.GetEndTimeCode()
     degree = int(prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get() or 0)
 
@@ -257,7 +257,7 @@ def read_usd(path: Path) -> MovingFile:
 
     count = len(get("positions", start))
     shapes = {"positions": (count, 3), "orientations": (count, 4), "scales": (count, 3), "opacities": (count,)}
-    shapes[USD_HARMONICS] = (count * (degree + 1) ** 2, 3)
+    shapes["radiance:sphericalHarmonicsCoefficients"] = (count * (degree + 1) ** 2, 3)
 
     def sample(t: float, stage: Any = stage) -> Gaussians[Floats]:  # without its stage a prim is empty
         found = {name: get(name, start + t * (end - start)) for name in shapes}
@@ -274,16 +274,9 @@ def read_usd(path: Path) -> MovingFile:
 
 def load_pxr() -> Any:
     """Import usd-core. Raises InputError where it is missing."""
-    for name in ("Gf", "Sdf", "Tf", "Usd", "UsdGeom", "UsdUtils", "Vt"):
+    for name in ("Gf", "Sdf", "Tf", "Usd", "UsdGeom", "UsdUtils", "UsdVol", "Vt"):
         optional_module(f"pxr.{name}", "OpenUSD files need usd-core", "usd")
     return optional_module("pxr", "OpenUSD files need usd-core", "usd")
-
-
-def _finite(values: Floats, path: Path) -> Floats:
-    bad = int((~np.isfinite(values).all(axis=1)).sum())
-    if bad or not len(values):
-        raise InputError(f"{path}: {bad} of {len(values)} Gaussians hold NaN or infinity; export it again.")
-    return values
 
 
 def _sigmoid(values: Floats) -> Floats:

@@ -103,8 +103,8 @@ class Panels:
         _tip("keys and mouse (?)")
         if state.training is not None:
             self._training(state.training)
-        if state.views:
-            chosen = _choice("camera", state.view, range(len(state.views)), [view.name for view in state.views])
+        if views := state.scene.views:
+            chosen = _choice("camera", state.view, range(len(views)), [view.name for view in views])
             if chosen != state.view:
                 state.stand_at(chosen)
         self._end()

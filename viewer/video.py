@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.errors import InputError, optional_module
+from lapgs_wgpu.errors import optional_module
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.progress import counted
 from lapgs_wgpu.splat.camera import Camera
@@ -18,15 +18,6 @@ from lapgs_wgpu.viewer.camera import ViewCamera
 
 TimedCamera = tuple[Camera, float]  # a camera and a time in the clip
 _QUALITY = "18"  # H.264's crf: hardly distinguishable from the rendered images
-_MOST_FRAMES = 1_000_000
-
-
-def count_frames(seconds: float, fps: float) -> int:
-    """Count the frames of a video. Raises InputError if it is 0 or above the limit."""
-    frames = round(seconds * fps)
-    if not 1 <= frames <= _MOST_FRAMES:
-        raise InputError(f"{seconds:g} s at {fps:g} frames a second are {frames} frames; give --seconds or --fps.")
-    return frames
 
 
 def orbit_views(
@@ -38,11 +29,10 @@ def orbit_views(
 ) -> Iterator[TimedCamera]:
     """Go around the focus once. time: fixed, in [0, 1]; None plays the clip once. arc: swing to these degrees
     clockwise and counterclockwise (`InitialView.arc`) instead of going all around."""
-    times = np.linspace(0, 1, frames).tolist()
-    for number in range(frames):
+    for number, passed in enumerate(np.linspace(0, 1, frames).tolist()):
         if number:
             start.orbit(_turned(number / frames, arc) - _turned((number - 1) / frames, arc), 0.0)
-        yield start.camera(*size), times[number] if time is None else time
+        yield start.camera(*size), passed if time is None else time
 
 
 def _turned(share: float, arc: tuple[float, float] | None) -> float:

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from lapgs_wgpu.viewer.frame import FrameRenderer
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 from lapgs_wgpu.viewer.render_modes import BACKGROUNDS, Mode
-
-if TYPE_CHECKING:
-    from lapgs_wgpu.data import View
 
 
 @dataclass
@@ -44,17 +40,12 @@ class ViewState:
         self.show_transport = scene.playback.moves
         self.view = -1
 
-    @cached_property
-    def views(self) -> tuple[View, ...]:
-        """The capture that the scene was trained on, where it is here. The first frame does not wait for it."""
-        return self.scene.views()
-
     def stand_at(self, view: int) -> None:
         """Go to a camera of the capture and to its time."""
         self.view = view
-        self.camera.stand_at(self.views[view].camera)
+        self.camera.stand_at(self.scene.views[view].camera)
         self.clock.playing = False
-        self.clock.seek(self.views[view].time)
+        self.clock.seek(self.scene.views[view].time)
 
     def next_mode(self) -> None:
         self.mode = _next(self.renderer.modes(), self.mode)
@@ -63,8 +54,8 @@ class ViewState:
         self.background = _next(list(BACKGROUNDS.values()), self.background)
 
     def next_view(self) -> None:
-        if self.views:
-            self.stand_at((self.view + 1) % len(self.views))
+        if self.scene.views:
+            self.stand_at((self.view + 1) % len(self.scene.views))
 
     def toggle_pause(self) -> None:
         if self.training is not None:
