@@ -155,8 +155,7 @@ def _export(given: Any, scene: LoadedScene) -> None:
     from lapgs_wgpu.viewer import export
 
     file, overwrite = Path(given.export), bool(given.overwrite)
-    ending, count = file.suffix.lower(), scene.playback.count
-    line = f"{count} Gaussians"
+    ending = file.suffix.lower()
     if ending in (".4dgs", ".lapgs", ".html", ".ply", *USD):
         export.check_free(scene, file, overwrite)
     if ending == ".4dgs":
@@ -168,17 +167,14 @@ def _export(given: Any, scene: LoadedScene) -> None:
 
         frames = given.frames or max(61, scene.clock().frames) if scene.playback.moves else 1
         loss = export_usd(scene, file, frames)
-        line = f"{count} Gaussians at {frames} times"
     elif ending in (".lapgs", ".html"):
         loss = export.export_compact(scene, file)
     elif ending == ".ply":
         loss = export.export_still(scene, file, given.time or 0.0)
-        line = f"{count} Gaussians at time {given.time or 0.0:g}"
     else:
         loss = export.export_frames(scene, file, given.frames, overwrite=overwrite)
-        line = f"{given.frames} frames of {count} Gaussians"
     size = f", {file.stat().st_size / 1e6:.2f} MB" if file.is_file() else ""
-    print(f"{file}: {line}{size}, {loss.psnr:.1f} dB PSNR against {scene.path}")
+    print(f"{file}: {scene.playback.count} Gaussians{size}, {loss.psnr:.1f} dB PSNR against {scene.path}")
     if loss.reason:
         print(f"warning: the loss is seen: {loss.reason}.", file=sys.stderr)
 

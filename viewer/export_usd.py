@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import tempfile
 from pathlib import Path
@@ -57,8 +58,9 @@ def _write(pxr: Any, stage: Any, scene: LoadedScene, frames: int) -> None:
     world = pxr.UsdGeom.Xform.Define(stage, "/World")
     stage.SetDefaultPrim(world.GetPrim())
     up, above = (pxr.Gf.Vec3d(*direction(name)) for name in (axis, "y" if axis == "y" else "z"))
-    world.AddTransformOp().Set(pxr.Gf.Matrix4d().SetRotate(pxr.Gf.Rotation(up, above)))
-    _write_camera(pxr, stage, scene)
+    upright = pxr.Gf.Matrix4d().SetRotate(pxr.Gf.Rotation(up, above))
+    world.AddTransformOp().Set(upright)
+    _write_camera(pxr, stage, scene, upright)
     splats = pxr.UsdVol.ParticleField3DGaussianSplat.Define(stage, "/World/Splats")
     pxr.Usd.ColorSpaceAPI.Apply(splats.GetPrim()).CreateColorSpaceNameAttr("srgb_rec709_display")
     splats.CreateRadianceSphericalHarmonicsDegreeAttr(scene.playback.at(0.0).sh_degree)
@@ -108,13 +110,12 @@ def _vt(pxr: Any, values: Floats) -> Any:
     return kind.FromNumpy(np.ascontiguousarray(values))
 
 
-def _write_camera(pxr: Any, stage: Any, scene: LoadedScene) -> None:
-    view = scene.camera().camera(640, 480)
-    camera = pxr.UsdGeom.Camera.Define(stage, "/World/Camera")
-    pose = np.linalg.inv(view.T_cam_world) @ np.diag([1.0, -1, -1, 1])  # USD's cameras look along -z, with y up
-    camera.AddTransformOp().Set(pxr.Gf.Matrix4d(pose.T))  # USD multiplies rows
-    camera.CreateFocalLengthAttr(50.0)
-    camera.CreateHorizontalApertureAttr(50.0 * view.width / view.K[0, 0])
-    camera.CreateVerticalApertureAttr(50.0 * view.height / view.K[1, 1])
-    distance = scene.camera().distance
-    camera.CreateClippingRangeAttr(pxr.Gf.Vec2f(0.01 * distance, 100 * distance))
+def _write_camera(pxr: Any, stage: Any, scene: LoadedScene, upright: Any) -> None:
+    view, distance = scene.camera(), scene.camera().distance
+    pose = np.linalg.inv(view.camera(640, 480).T_cam_world) @ np.diag([1.0, -1, -1, 1])  # USD looks along -z, y is up
+    camera = pxr.Gf.Camera(
+        pxr.Gf.Matrix4d(pose.T) * upright,  # USD multiplies rows
+        clippingRange=pxr.Gf.Range1f(0.01 * distance, 100 * distance),
+    )
+    camera.SetPerspectiveFromAspectRatioAndFieldOfView(640 / 480, math.degrees(view.fov_y), pxr.Gf.Camera.FOVVertical)
+    pxr.UsdGeom.Camera.Define(stage, "/World/Camera").SetFromCamera(camera, pxr.Usd.TimeCode.Default())

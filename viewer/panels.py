@@ -11,7 +11,6 @@ from wgpu.utils.imgui import ImguiRenderer
 
 from lapgs_wgpu.viewer.clock import LOOPS, SPEEDS
 from lapgs_wgpu.viewer.controls import KEYS, MOUSE
-from lapgs_wgpu.viewer.present import HEAT
 from lapgs_wgpu.viewer.render_modes import BACKGROUNDS, MODES
 from lapgs_wgpu.viewer.view_state import TrainingControl, ViewState
 from lapgs_wgpu.viewer.viewport import Viewport
@@ -89,7 +88,7 @@ class Panels:
         _tip(MODES[state.mode])
         frame = self.viewport.frame
         if frame is not None and frame.request.mode in ("depth", "motion"):
-            _legend(frame.low, frame.high)
+            imgui.text(f"dark {frame.low:.3g}, bright {frame.high:.3g}")
         state.background = _choice("ground", state.background, list(BACKGROUNDS.values()), list(BACKGROUNDS))
         _tip("background")
         _, state.antialiased = imgui.checkbox("antialiased", state.antialiased)
@@ -200,20 +199,6 @@ def _slider_value() -> float:
     half_grab = imgui.get_style().grab_min_size / 2 + 2  # imgui's own padding
     left, right = imgui.get_item_rect_min().x + half_grab, imgui.get_item_rect_max().x - half_grab
     return float((imgui.get_mouse_pos().x - left) / max(right - left, 1.0))
-
-
-def _legend(low: float, high: float) -> None:
-    x, y = imgui.get_cursor_screen_pos()
-    width = imgui.get_content_region_avail().x
-    step = width / (len(HEAT) - 1)
-    draw = imgui.get_window_draw_list()
-    for i in range(len(HEAT) - 1):
-        a, b = (imgui.get_color_u32((*color, 1.0)) for color in HEAT[i : i + 2])
-        draw.add_rect_filled_multi_color((x + i * step, y), (x + (i + 1) * step, y + 10), a, b, b, a)
-    imgui.dummy((width, 12))
-    imgui.text(f"{low:.3g}")
-    imgui.same_line(max(0.0, width - imgui.calc_text_size(f"{high:.3g}").x))
-    imgui.text(f"{high:.3g}")
 
 
 def _style() -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.images import encode_jpeg
-from lapgs_wgpu.gpu.shader import Binding, Defines, browser_source, compose, reflect, struct_layout
+from lapgs_wgpu.gpu.shader import Defines, browser_source, compose, reflect, struct_layout
 from lapgs_wgpu.motion.fields.config import MIN_SCALE
 from lapgs_wgpu.splat.drawing import sh_defines
 from lapgs_wgpu.splat.raster_config import gpu_config
@@ -66,19 +66,10 @@ def player_data() -> dict[str, Any]:
         "kernels": {name: _shader(browser_source(compose(*shape))) for name, shape in PASSES.items()},
         "always": always,
         "field": _FIELD,
-        "raster": {
-            "tile": [_PLAIN.tile_width, _PLAIN.tile_height],
-            "plain": "rasterize",
-            "subgroups": "rasterize SUBGROUPS",
-            "depth": "rasterize DEPTH",
-        },
+        "tile": [_PLAIN.tile_width, _PLAIN.tile_height],
         "present": _shader(compose("present", {})),
         "minScale": MIN_SCALE,
-        "controls": {
-            "keys": {key.key: key.action for key in page_keys()},
-            "orbit": ORBIT,
-            "zoom": ZOOM,
-        },
+        "controls": {"keys": {key.key: key.action for key in page_keys()}, "orbit": ORBIT, "zoom": ZOOM},
         "viewport": {"settled": SETTLED, "target": TARGET_SECONDS, "smallest": SMALLEST_SCALE},
         "loops": LOOPS,
         "speeds": SPEEDS,
@@ -87,19 +78,16 @@ def player_data() -> dict[str, Any]:
 
 
 def _shader(source: str) -> dict[str, Any]:
-    bindings = reflect(source)
-    uniforms = {name: _uniform(source, binding) for name, binding in bindings.items() if binding.kind == "uniform"}
+    """Describe a shader: number and kind of each binding; size in bytes of each uniform, and offset, type (f or I) and
+    length of its members."""
+    bindings, uniforms = reflect(source), {}
+    for name, binding in bindings.items():
+        if binding.kind == "uniform":
+            size, members = struct_layout(source, binding.type)
+            places = {member: [at, code[-1], int(code[:-1] or 1)] for member, (at, code) in members.items()}
+            uniforms[name] = {"size": size, "members": places}
     numbers = {name: [binding.number, binding.kind] for name, binding in bindings.items()}
     return {"source": source, "bindings": numbers, "uniforms": uniforms}
-
-
-def _uniform(source: str, binding: Binding) -> dict[str, Any]:
-    """Describe a uniform: its size in bytes, and offset, type (f or I) and length of each member."""
-    size, members = struct_layout(source, binding.type)
-    return {
-        "size": size,
-        "members": {name: [at, code[-1], int(code[:-1] or 1)] for name, (at, code) in members.items()},
-    }
 
 
 def page_html(scene: bytes, title: str, poster: NDArray[np.uint8], *, narrowest: float = 1.0) -> str:

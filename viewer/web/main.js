@@ -89,8 +89,8 @@ async function open(load, data, state = null) {
 }
 
 async function prepare(gpu, scene, data, former, progress) {
-    const rasterizer = new Rasterizer(gpu, data.raster);
-    const keys = [...data.always, data.raster.plain, rasterizer.rasterize, `color SH ${scene.shDegree}`];
+    const rasterizer = new Rasterizer(gpu, data.tile);
+    const keys = [...data.always, "rasterize", rasterizer.rasterize, `color SH ${scene.shDegree}`];
     gpu.device.pushErrorScope("out-of-memory");
     const playback = new Playback(gpu, scene, data.minScale);
     if (await gpu.device.popErrorScope()) {

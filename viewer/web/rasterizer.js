@@ -15,13 +15,11 @@ const roomy = intersections => Math.floor((Math.floor(5 * intersections / 4) + 4
 const groups = count => Math.ceil(count / LANES);
 
 export class Rasterizer {
-    // raster: tile sizes and kernel keys (viewer/web_page.py).
-    constructor(gpu, raster) {
+    // tile: its width and height.
+    constructor(gpu, tile) {
         this.gpu = gpu;
-        this.tile = raster.tile;
-        this.rasterize = gpu.subgroups ? raster.subgroups : raster.plain;
-        this.plain = raster.plain;
-        this.depth = raster.depth;
+        this.tile = tile;
+        this.rasterize = gpu.subgroups ? "rasterize SUBGROUPS" : "rasterize";
         this.pool = new Pool(gpu);
         this.plan = { capacity: FIRST_CAPACITY, bands: 1 };
         this.maxCapacity = Math.floor(gpu.maxBinding / RECORD_BYTES);
@@ -41,7 +39,7 @@ export class Rasterizer {
         }
         const { bands } = this.plan;
         const drawing = {
-            gaussians, camera, background, plan: this.plan, rasterize: depth ? this.depth : this.rasterize,
+            gaussians, camera, background, plan: this.plan, rasterize: depth ? "rasterize DEPTH" : this.rasterize,
             image: this.pool.array("image", (depth ? 20 : 16) * camera.width * camera.height),
             splats: this.pool.array("splats", SPLAT_BYTES * gaussians.count),
         };
@@ -59,8 +57,8 @@ export class Rasterizer {
     // Whether the drawing is whole. If not it has to be drawn again, with larger buffers, more bands or without subgroups.
     valid(drawing, counts) {
         const { plan } = drawing;
-        if (counts[3 * plan.bands + 2] && this.rasterize !== this.plain) { // its workgroups are no subgroups
-            this.rasterize = this.plain;
+        if (counts[3 * plan.bands + 2] && this.rasterize !== "rasterize") { // its workgroups are no subgroups
+            this.rasterize = "rasterize";
             return false;
         }
         const totals = Array.from({ length: plan.bands }, (_, band) => counts[3 * band]);

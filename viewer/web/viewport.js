@@ -80,7 +80,7 @@ export class Viewport {
         this.busy = true;
         try {
             const { playback: { gpu }, rasterizer, canvas, state: { camera } } = this;
-            await gpu.compile([rasterizer.depth]);
+            await gpu.compile(["rasterize DEPTH"]);
             const { image, camera: { width, height, focal, center } } = await this.drawWhole(1, true);
             const [column, row] = [[x / canvas.clientWidth, width], [y / canvas.clientHeight, height]] // a drag may end outside
                 .map(([share, size]) => Math.min(Math.max(Math.floor(share * size), 0), size - 1));
