@@ -49,9 +49,16 @@ class ViewCamera:
         self.position, self.focus, self.rotation, self.fov_y = self._start
 
     def orbit(self, right: float, down: float) -> None:
-        """Turn about the focus, as if the scene were dragged; radians."""
+        """Turn about the focus, as if the scene were dragged; radians. To the right it turns about `up`, so that the
+        horizon stays as level, or as rolled, as it was."""
         distance = self.distance
-        self._turn(right, down)
+        turned = self.rotation @ _about(self.up, right)
+        across = np.cross(turned[2], self.up)
+        length = np.linalg.norm(across)
+        across = across / length if length > 1e-6 else turned[0]
+        pitch = math.asin(float(np.clip(turned[2] @ self.up, -1, 1)))
+        new = float(np.clip(pitch - down, -_STEEPEST, _STEEPEST))
+        self.rotation = turned @ _about(across, pitch - new)
         self.position = self.focus - distance * self.rotation[2]
 
     def pan(self, right: float, down: float) -> None:
@@ -76,17 +83,6 @@ class ViewCamera:
         f = 0.5 * height / math.tan(0.5 * self.fov_y)
         K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]])
         return Camera(K, world_to_camera(self.rotation.T, self.position), width, height, self.near)
-
-    def _turn(self, right: float, down: float) -> None:
-        """Turn the line of sight: about `up` so that the scene goes to the right, and about the horizontal axis. The
-        horizon stays as level, or as rolled, as it was."""
-        turned = self.rotation @ _about(self.up, right)
-        across = np.cross(turned[2], self.up)
-        length = np.linalg.norm(across)
-        across = across / length if length > 1e-6 else turned[0]
-        pitch = math.asin(float(np.clip(turned[2] @ self.up, -1, 1)))
-        new = float(np.clip(pitch - down, -_STEEPEST, _STEEPEST))
-        self.rotation = turned @ _about(across, pitch - new)
 
 
 def _about(axis: Vector, angle: float) -> NDArray[np.float64]:

@@ -16,7 +16,6 @@ from lapgs_wgpu.viewer.render_modes import BACKGROUNDS
 
 if TYPE_CHECKING:
     from lapgs_wgpu.data import View
-    from lapgs_wgpu.gpu.device import Device
     from lapgs_wgpu.splat.camera import Camera
     from lapgs_wgpu.viewer.loaded_scene import LoadedScene
     from lapgs_wgpu.viewer.offscreen import OffscreenRenderer
@@ -38,9 +37,10 @@ def _view(arguments: list[str]) -> None:
         return
     if given.file is None:
         raise InputError("name a file or a folder of frames; lapgs-view --help says more.")
+    from lapgs_wgpu.gpu.device import open_device
+
     with ThreadPoolExecutor(1) as other:
-        # Beside all that follows: the driver and its compiler take longer than the rest together.
-        device = other.submit(_warm_device, given.device)
+        device = other.submit(open_device, given.device)  # beside all that follows, which takes as long together
         # Before the scene is read, which may take a while: whether there is a place to show it.
         show = _window(given) if job == "window" else partial(_JOBS[job], given)
         from lapgs_wgpu.viewer.loaded_scene import load_scene
@@ -50,15 +50,6 @@ def _view(arguments: list[str]) -> None:
     if given.mode == "motion" and not scene.playback.moves:
         raise InputError(f"{scene.path}: does not move; --mode motion shows nothing.")
     show(scene)
-
-
-def _warm_device(name: str | None) -> Device:
-    from lapgs_wgpu.gpu.device import open_device
-    from lapgs_wgpu.viewer.frame import warm_up
-
-    device = open_device(name)
-    warm_up(device)
-    return device
 
 
 def _window(given: Any) -> Callable[[LoadedScene], None]:

@@ -51,13 +51,11 @@ def export_frames(scene: LoadedScene, folder: Path, frames: int, *, overwrite: b
     """Write a still frame_0000.ply for each of the times evenly from 0 to 1, and their manifest, into a new or an empty
     folder; compare what is played with the scene.
 
-    overwrite: frames of an earlier export go, other files stay. Raises InputError where it cannot be written.
+    overwrite: frames of an earlier export go, other files stay. Raises InputError where the folder is not empty, and
+    OSError where it cannot be written.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        held = list(folder.iterdir())
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be used as a folder ({error.strerror or error}).") from error
+    folder.mkdir(parents=True, exist_ok=True)
+    held = list(folder.iterdir())
     if held and not overwrite:
         raise InputError(f"{folder}: is not empty; --overwrite replaces the frames in it.")
     old = [file for file in held if file.match("frame_*.ply") or file.name == MANIFEST]
@@ -65,8 +63,7 @@ def export_frames(scene: LoadedScene, folder: Path, frames: int, *, overwrite: b
         check_free(scene, file, overwrite)
     for file in old:
         file.unlink()
-    digits = max(4, len(str(frames - 1)))
-    names = [f"frame_{number:0{digits}}.ply" for number in range(frames)]
+    names = [f"frame_{number:04}.ply" for number in range(frames)]
     for name, time in zip(counted(names, frames, "frames"), np.linspace(0, 1, frames).tolist(), strict=True):
         _write_still(scene, folder / name, time)
     manifest = {

@@ -53,21 +53,19 @@ def export_4dgs(scene: LoadedScene, file: Path, max_error: float) -> Loss:
             profile="fine",
             library="lapgs_wgpu",
             metadata={"color_space": "linear-rec709-display", "visibility_profile": "box"},
-            provenance=_frame(scene.initial_view),
+            provenance=_frame(fourdgs, scene.initial_view),
             preserve_source_ids=True,
         )
         fov, position, focus = math.degrees(camera.fov_y), tuple(camera.position), tuple(camera.focus)
         view = fourdgs.CameraTrajectory(fov, position, focus, interpolation="linear")
         sh = playback.at(0.0).sh.read()  # (N, K, 3); those of degree 0 change with time
-        fourdgs.write(target, _gaussian_set(pieces, sh, seconds), seconds, options=options, camera=view)
+        fourdgs.write(target, _gaussian_set(fourdgs, pieces, sh, seconds), seconds, options=options, camera=view)
     written = SampledPlayback(playback.device, read_4dgs(file))
     return measure(scene, written, fourdgs.read(file).gaussians.source_index)
 
 
-def _gaussian_set(pieces: Pieces, sh: NDArray[np.float32], seconds: float) -> Any:
+def _gaussian_set(fourdgs: Any, pieces: Pieces, sh: NDArray[np.float32], seconds: float) -> Any:
     """Convert pieces to the library's Gaussians, with times in seconds and colors as linear light."""
-    import fourdgs
-
     colors = sh[pieces.source].astype(np.float64)
     colors[:, 0] = pieces.dc
     degree = best_degree(colors)
@@ -116,10 +114,8 @@ def harmonics_bytes(coefficients: NDArray[np.floating]) -> NDArray[np.uint8]:
     return np.rint((coefficients + SH_RANGE) * (255 / (2 * SH_RANGE))).clip(0, 255).astype(np.uint8)
 
 
-def _frame(view: InitialView) -> Any:
+def _frame(fourdgs: Any, view: InitialView) -> Any:
     """Name the axes of the file that are nearest to up and ahead."""
-    import fourdgs
-
     up = AXES.index(nearest_axis(view.up))
     ahead = AXES.index(nearest_axis(view.camera.T_cam_world[2, :3] * (np.arange(3) != up % 3)))
     frame = fourdgs.CoordinateFrame(handedness=1, up_axis=up, forward_axis=ahead)  # right-handed, of no unit

@@ -9,11 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from lapgs_wgpu.gpu.array import DeviceArray
-from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.playback.playback import Playback
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.viewer.render_modes import MODES, Mode
 
@@ -44,14 +42,6 @@ class Frame:
     high: float = 1.0
     seconds: float = 0.0
     splats: int = 0
-
-
-def warm_up(device: Device) -> None:
-    """Have the driver compile the passes of a picture, with harmonics of degree 3, by drawing one Gaussian."""
-    shapes = ((1, 3), (1, 4), (1, 3), (1,), (1, 16, 3))
-    one = Gaussians(*(DeviceArray.upload(device, "one Gaussian", np.ones(shape, np.float32)) for shape in shapes))
-    camera = Camera.looking_at([1, 1, -3], [1, 1, 1], up=[0, -1, 0], fov_x=0.7, width=16, height=16)
-    Rasterizer(device).draw_whole(one, camera)
 
 
 class FrameRenderer:

@@ -78,12 +78,9 @@ class LoadedScene:
     def view_number(self, wanted: str) -> int:
         """The number in `views` of the one with this name or number. Raises InputError."""
         names = [view.name for view in self.views]
-        if not names:
-            raise InputError(
-                f"--view {wanted}: beside {self.path} is no config.toml that names a capture which is here."
-            )
         if wanted not in names and wanted not in map(str, range(len(names))):
-            raise InputError(f"--view {wanted}: views are 0 to {len(names) - 1}, {names[0]} to {names[-1]}.")
+            config = self.path.parent / "config.toml"
+            raise InputError(f"--view {wanted}: is none of the {len(names)} views of a capture that {config} names.")
         return names.index(wanted) if wanted in names else int(wanted)
 
     @property
@@ -117,10 +114,9 @@ def load_scene(
             file = dataclasses.replace(file, antialiased=antialiased)
         playback, frames = playback_of(file, device()), None
     initial_view = InitialView.from_json(playback.metadata.get("view", ""))
-    if initial_view is None:
+    if initial_view is None or up is not None:
+        frames = frames or (initial_view.frames if initial_view else None)
         initial_view = guess_view(playback, up or playback.metadata.get("up"))
-    elif up is not None:
-        initial_view = guess_view(playback, up)._replace(frames=initial_view.frames)
     return LoadedScene(path, playback, initial_view._replace(frames=frames or initial_view.frames), file)
 
 
