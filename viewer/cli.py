@@ -125,7 +125,7 @@ def _video(given: Any, scene: LoadedScene) -> None:
     if path != "view" and given.time is not None:
         raise InputError(f"--time has no use with --path {path}, along which time passes.")
     view, wanted, time = _place(given, scene)
-    size = video.even(wanted)
+    size = max(2, wanted[0] // 2 * 2), max(2, wanted[1] // 2 * 2)  # as the pixel format yuv420p needs it
     if size != wanted:
         print(f"note: mp4 needs even sizes: {size_text(wanted)} becomes {size_text(size)}", file=sys.stderr)
     fps = given.fps or 30.0

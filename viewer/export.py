@@ -39,12 +39,8 @@ def export_still(scene: LoadedScene, file: Path, time: float) -> Loss:
 
     Raises InputError where it cannot be written.
     """
-    _write_still(scene, file, time)
-    return measure(scene, playback_of(read_scene(file), scene.playback.device), time=time)
-
-
-def _write_still(scene: LoadedScene, file: Path, time: float) -> None:
     write_ply(file, scene.playback.snapshot(time), antialiased=scene.playback.at(time).antialiased)
+    return measure(scene, playback_of(read_scene(file), scene.playback.device), time=time)
 
 
 def export_frames(scene: LoadedScene, folder: Path, frames: int, *, overwrite: bool = False) -> Loss:
@@ -64,12 +60,13 @@ def export_frames(scene: LoadedScene, folder: Path, frames: int, *, overwrite: b
     for file in old:
         file.unlink()
     names = [f"frame_{number:04}.ply" for number in range(frames)]
+    antialiased = scene.playback.at(0.0).antialiased
     for name, time in zip(counted(names, frames, "frames"), np.linspace(0, 1, frames).tolist(), strict=True):
-        _write_still(scene, folder / name, time)
+        write_ply(folder / name, scene.playback.snapshot(time), antialiased=antialiased)
     manifest = {
         "fps": max(1, frames - 1) / scene.clock().seconds,  # so that they last as long as the clip
         "up": nearest_axis(scene.initial_view.up),
-        "antialiased": scene.playback.at(0.0).antialiased,
+        "antialiased": antialiased,
         "view": scene.initial_view._replace(frames=frames).to_json(),
         "frames": names,
     }

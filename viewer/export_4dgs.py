@@ -25,7 +25,6 @@ MAX_ERROR = 0.5  # pixels, without --max-error
 _SHADE = 4 / 255  # largest change of opacity and color within a piece
 _OF_LINES = 0.85  # share of the error that straight lines may use up; the rest is for the format's rounding
 _TIME_STEP = 1e-3  # seconds: the library rounds the middles of pieces to it (profile "fine")
-_PROGRESS = 1000
 
 
 def export_4dgs(scene: LoadedScene, file: Path, max_error: float) -> Loss:
@@ -42,10 +41,10 @@ def export_4dgs(scene: LoadedScene, file: Path, max_error: float) -> Loss:
     camera, seconds = scene.camera(), scene.clock().seconds
     pixel = 2 * math.tan(0.5 * camera.fov_y) * camera.distance / scene.initial_view.camera.height  # world units
     with atomic_write(file) as target:  # before minutes of work
-        with Progress(_PROGRESS, "thousandths of the motion") as progress:
+        with Progress(1000, "thousandths of the motion") as progress:
             allowed = _OF_LINES * max_error * pixel
             pieces = linear_pieces(playback, allowed, _SHADE, lambda share: progress.at(1 + int(998 * share)))
-            progress.at(_PROGRESS)
+            progress.at(1000)
         if not len(pieces.source):
             raise InputError(f"{scene.path}: holds no Gaussians that can be seen.")
         pieces = pieces._replace(opacities=pieces.opacities * plain_factors(scene)[pieces.source])

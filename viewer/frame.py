@@ -66,19 +66,22 @@ class FrameRenderer:
         start = time.perf_counter()
         camera, mode = request.camera, request.mode
         low, high, background = 0.0, 1.0, request.background
-        # Before the Gaussians: measuring may take them to other times.
-        value = self._motion() if mode == "motion" else None
+        colors = None
+        if mode == "motion":  # before the Gaussians, which measuring takes to other times
+            colors, high = self._motion()
+            background = (0.0, 0.0, 0.0)
         gaussians = self.playback.at(request.time)
         if request.antialiased is not None:
             gaussians = dataclasses.replace(gaussians, antialiased=request.antialiased)
-        if value is not None:
-            colors, high = value
+        if colors is not None:
             gaussians = dataclasses.replace(gaussians, sh=colors)
-            background = (0.0, 0.0, 0.0)
         drawing = self._rasterizer.draw_whole(gaussians, camera, background, depth=mode == "depth")
         splats = int(drawing.lists.visible.read()[0])
         if mode == "depth":
-            low, high = self._depth_range(drawing.image)
+            rest, depth = drawing.image.read()[3:]
+            seen = rest < 0.5
+            if seen.any():
+                low, high = np.percentile(depth[seen] / (1.0 - rest[seen]), [1, 99]).tolist()
         return Frame(request, drawing.image, low, high, time.perf_counter() - start, splats)
 
     def depth_at(self, frame: Frame, column: int, row: int) -> float | None:
@@ -86,14 +89,6 @@ class FrameRenderer:
         planes = self.draw(frame.request._replace(mode="depth")).planes.read()
         alpha = 1.0 - float(planes[3, row, column])
         return float(planes[4, row, column]) / alpha if alpha > 0.1 else None
-
-    def _depth_range(self, planes: DeviceArray) -> tuple[float, float]:
-        rest, depth = planes.read()[3:]
-        seen = rest < 0.5
-        if not seen.any():
-            return 0.0, 1.0
-        low, high = np.percentile(depth[seen] / (1.0 - rest[seen]), [1, 99])
-        return float(low), float(high)
 
     def _motion(self) -> tuple[DeviceArray, float]:
         """Return how far each Gaussian moves as its color (N, 3), and the distance at the end of the scale."""

@@ -132,9 +132,8 @@ def guess_view(playback: Playback, axis: str | None = None) -> InitialView:
     middle = np.median(means, axis=0)
     radius = max(float(np.quantile(np.linalg.norm(means - middle, axis=1), 0.9)), 1e-3)
     extent = np.subtract(*np.quantile(means, [0.9, 0.1], axis=0))
-    flat = extent[2] < _FLAT * min(extent[0], extent[1])
     if axis not in AHEAD:
-        axis = "z" if flat else "-y"
+        axis = "z" if extent[2] < _FLAT * min(extent[0], extent[1]) else "-y"
     up, ahead = direction(axis), direction(AHEAD[axis])
     away = math.sin(_ELEVATION) * up - math.cos(_ELEVATION) * ahead
     camera = Camera.looking_at(middle + 3.6 * radius * away, middle, up=up.tolist(), fov_x=0.9, width=640, height=480)

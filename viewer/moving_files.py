@@ -83,10 +83,8 @@ def open_moving(path: Path) -> MovingFile | None:
     if path.is_dir() and not (path / "checkpoint.ply").exists():
         files = sorted(path.glob("*.ply"), key=lambda file: natural_key(file.name))
         return read_frames(files, {}) if files else None
-    if path.suffix.lower() == ".ply":
-        return read_spacetime_ply(path)
-    readers = {".json": read_sequence, ".splatv": read_splatv, ".4dgs": read_4dgs} | dict.fromkeys(USD, read_usd)
-    reader = readers.get(path.suffix.lower())
+    readers = {".json": read_sequence, ".ply": read_spacetime_ply, ".splatv": read_splatv, ".4dgs": read_4dgs}
+    reader = (readers | dict.fromkeys(USD, read_usd)).get(path.suffix.lower())
     return reader(path) if reader else None
 
 

@@ -11,13 +11,13 @@ from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 from lapgs_wgpu.viewer.present import Presenter
 from lapgs_wgpu.viewer.render_modes import Mode
 
-Color = tuple[float, float, float]
-
 
 class OffscreenRenderer:
     """Renders images of a scene."""
 
-    def __init__(self, scene: LoadedScene, mode: Mode = "rgb", background: Color | None = None) -> None:
+    def __init__(
+        self, scene: LoadedScene, mode: Mode = "rgb", background: tuple[float, float, float] | None = None
+    ) -> None:
         self._renderer, self._presenter = FrameRenderer(scene.playback), Presenter(scene.playback.device)
         self._mode, self._background = mode, scene.background if background is None else background
 

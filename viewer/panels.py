@@ -132,8 +132,7 @@ class Panels:
         imgui.set_next_window_bg_alpha(0.6)
         imgui.begin("overlay", None, _BAR | imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_nav)
         frame, camera = viewport.frame, viewport.frame.request.camera
-        rate = f"{viewport.fps:.0f} fps" if viewport.fps else "at rest"
-        imgui.text(f"{rate}   {1000 * frame.seconds:.1f} ms a frame")
+        imgui.text(f"{1 / max(frame.seconds, 1e-4):.1f} frames a second   {1000 * frame.seconds:.1f} ms")
         imgui.text(f"{frame.splats:,} of {state.scene.playback.count:,} splats")
         imgui.text(
             f"{camera.width}x{camera.height}" + (f" ({100 * viewport.scale:.0f} %)" if viewport.scale < 1 else "")

@@ -43,11 +43,6 @@ def _turned(share: float, arc: tuple[float, float] | None) -> float:
     return math.radians(wave * (arc[0] if wave > 0 else arc[1]))
 
 
-def even(size: tuple[int, int]) -> tuple[int, int]:
-    """Round a size down to what the pixel format yuv420p allows: even and at least 2x2."""
-    return max(2, size[0] // 2 * 2), max(2, size[1] // 2 * 2)
-
-
 def write_video(
     file: Path,
     cameras: Iterator[TimedCamera],

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections import deque
 from typing import Any
 
 from lapgs_wgpu.viewer.frame import Frame, FrameRequest
@@ -37,13 +36,6 @@ class Viewport:
         self._drawn: tuple[Any, ...] = ()  # all that the frame depends on
         self.stale = False
         self.moved_at = time.perf_counter()
-        self._times: deque[float] = deque(maxlen=30)
-
-    @property
-    def fps(self) -> float:
-        """Count the frames of the scene drawn in the last second."""
-        recent = [drawn for drawn in self._times if drawn > time.perf_counter() - 1.0]
-        return len(recent) - 1.0 if len(recent) > 1 else 0.0
 
     @property
     def at_rest(self) -> bool:
@@ -75,7 +67,6 @@ class Viewport:
             camera = full.resized(max(1, round(self.scale * full.width)), max(1, round(self.scale * full.height)))
         self.frame = state.renderer.draw(FrameRequest(camera, *shown))
         self._drawn, self.stale = key, False
-        self._times.append(time.perf_counter())
         if moving:
             ideal = self.scale * math.sqrt(TARGET_SECONDS / max(self.frame.seconds, 1e-4))
             ideal = 0.5 * (self._moving_scale + ideal)
