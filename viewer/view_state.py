@@ -68,4 +68,4 @@ class ViewState:
 
 
 def _next(choices: Any, present: Any) -> Any:
-    return choices[(choices.index(present) + 1) % len(choices)] if present in choices else choices[0]
+    return choices[(choices.index(present) + 1) % len(choices)]
