@@ -111,17 +111,12 @@ def snapshot_of(values: Floats, names: list[str], path: PathLike) -> GaussianSna
     """The Gaussians of columns (N, len(names)) in the order of `gaussian_names`. Raises InputError as above."""
     _check_values(values, names, f"{path}:")
     rest = len(names) - len(_names(0))
-    end = 6 + rest  # of the colors
+    parts = np.split(values, np.cumsum([3, 3, rest, 1, 3]), axis=1)
+    means, dc, others, opacities, scales, quats = map(np.ascontiguousarray, parts)
     sh = np.empty((len(values), 1 + rest // 3, 3), np.float32)
-    sh[:, 0] = values[:, 3:6]
-    sh[:, 1:] = values[:, 6:end].reshape(len(values), 3, rest // 3).transpose(0, 2, 1)  # channel-major in the file
-    return GaussianSnapshot(
-        means=values[:, 0:3].copy(),
-        sh=sh,
-        opacity_logits=values[:, end].copy(),
-        log_scales=values[:, end + 1 : end + 4].copy(),
-        quats=values[:, end + 4 : end + 8].copy(),
-    )
+    sh[:, 0] = dc
+    sh[:, 1:] = others.reshape(len(values), 3, rest // 3).transpose(0, 2, 1)  # channel-major in the file
+    return GaussianSnapshot(means, sh, opacities[:, 0], scales, quats)
 
 
 def gaussian_names(vertex: Element, known: set[str], path: PathLike) -> list[str]:
@@ -144,12 +139,9 @@ def gaussian_names(vertex: Element, known: set[str], path: PathLike) -> list[str
     names = _names(rest)
     missing = [name for name in names if name not in known]
     if missing:
-        problem = "without which its Gaussians are not complete; export it with all properties of 3DGS"
-        if not any(name.startswith(("opacity", "scale_", "rot_")) for name in properties):
-            problem = "so it holds no Gaussians; a cloud of points is not shown, and a training may start at it"
         raise InputError(
-            f"{path}: its element vertex has {len(properties)} properties and lacks {len(missing)}, such as "
-            f"{', '.join(missing[:5])}, {problem}"
+            f"{path}: its element vertex has {len(properties)} properties and lacks {len(missing)} of 3DGS, such as "
+            f"{', '.join(missing[:5])}; export it with all (a cloud of points is not shown, a training may start at it)"
         )
     if vertex.count == 0:
         raise InputError(f"{path}: holds 0 Gaussians; at least 1 is needed")
