@@ -155,11 +155,7 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
     with log, stop_requests() as interrupted:
         if training.discovery is not None:
             log.discovered(training.discovery)
-        training.callbacks.append(log.after_step)
-        if config.eval.interval:
-            training.callbacks.append(partial(_log_psnr, log))
-        if config.schedule.save_interval:
-            training.callbacks.append(partial(_save_now_and_then, out))
+        training.callbacks.append(partial(_after_step, out, log))
         steps = _steps(training, out, interrupted)
         if watch is not None:
             watch(out / "checkpoint.ply", scene, training.initial_view, steps)
@@ -197,17 +193,17 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
     return scene
 
 
-def _log_psnr(log: Log, training: Trainer, result: StepResult) -> None:
-    """Log the mean PSNR of the validation views, or of some training views, every eval.interval steps."""
-    if result.step % training.config.eval.interval == 0:
+def _after_step(out: Path, log: Log, training: Trainer, result: StepResult) -> None:
+    """Log a step; at their intervals, log the mean PSNR of the validation views, or of some training views, and save
+    the state."""
+    log.after_step(training, result)
+    eval_interval, save_interval = training.config.eval.interval, training.config.schedule.save_interval
+    if eval_interval and result.step % eval_interval == 0:
         start, data = time.perf_counter(), training.dataset
         name, views = ("val", data.val) if data.val else ("train", spread_views(data.train, TRAINING_VIEWS))
         psnr = training.psnr(views)
         log.evaluated(result.step, psnr, name, time.perf_counter() - start)
-
-
-def _save_now_and_then(out: Path, training: Trainer, result: StepResult) -> None:
-    if result.step % training.config.schedule.save_interval == 0 and result.step < result.steps:
+    if save_interval and result.step % save_interval == 0 and result.step < result.steps:
         save_state(out, training.state())
 
 
@@ -217,11 +213,12 @@ def _steps(training: Trainer, out: Path, interrupted: threading.Event) -> Iterat
     try:
         while training.done < last and not interrupted.is_set():
             yield training.step()
-    except (DeviceError, NumericalError, MemoryError) as error:
-        kind = MemoryError if not isinstance(error, DeviceError | NumericalError) else type(error)  # numpy has its own
-        raise kind(f"{error}{_saved(training, out)}") from error
-    except Exception:
-        _saved(training, out)
+    except Exception as error:
+        told = _saved(training, out)
+        if isinstance(error, DeviceError | NumericalError):
+            raise type(error)(f"{error}{told}") from error
+        if isinstance(error, MemoryError):  # numpy has its own
+            raise MemoryError(f"{error}{told}") from error
         raise
     finally:
         training.close()
@@ -248,24 +245,15 @@ def evaluate_run(
     data: DataConfig,
     training: dict[str, Any],
     lpips: Lpips | None = None,
-) -> dict[str, object]:
-    """Evaluate on the test views; write metrics.json and eval/ of a run folder; returns the metrics.
+) -> None:
+    """Evaluate on the test views; write metrics.json and eval/ of a run folder.
 
-    data: says on which background. lpips: as for `evaluate`.
+    data: says on which background. training: goes into metrics.json as it is. lpips: as for `evaluate`.
     """
     folder = out / "eval"
     if folder.is_symlink():
         raise InputError(f"{folder} is a link, and images are written into the run's own folder only; remove it.")
     folder.mkdir(exist_ok=True)
     with Progress(len(dataset.test), "test views measured") as progress:
-        metrics = evaluate(
-            scene,
-            dataset.test,
-            data.background,
-            folder,
-            lpips=lpips,
-            progress=progress,
-        )
-    metrics["training"] = training
-    write_metrics(out, metrics)
-    return metrics
+        metrics = evaluate(scene, dataset.test, data.background, folder, lpips=lpips, progress=progress)
+    write_metrics(out, {**metrics, "training": training})

@@ -41,20 +41,8 @@ keys of the configuration [in brackets: values of the preset {preset}]:
   "World units" are those of the scene after it was moved and scaled into the cube from -1.3 to 1.3; D-NeRF scenes keep
   their coordinates. "The cameras' extent" is 1.1 times the largest distance of a training camera from their mean. "With
   discovery" means: if the training starts with motion discovery (discovery.enabled). "The paper" is "Laplacian Analysis
-  Meets Dynamics Modelling"."""
-# What the keys of a section have in common.
-SECTIONS = {
-    "field": "static and temporal have four keys each: .levels, the number of resolution levels; .base and .finest, "
-    "three numbers each, the resolution of the coarsest and of the finest level along each axis; .table_log2, log2 of "
-    "the largest number of entries of a level. planes has .features (per plane and level), .space and .time "
-    "(resolution of the coarsest level) and .levels, each of which doubles .space.",
-    "rates": "Learning rates of Adam; 0: the parameter does not change. KEY is start, end or steps: the rate changes "
-    "exponentially from .start to .end, which it reaches at step .steps.",
-    "acceleration": "The acceleration loss, which makes motion even.",
-    "cameras": "The keys of rate are those of rates.",
-    "exposure": "The keys of rate are those of rates.",
-    "smoothness": "The smoothness loss of the fields grid4d, laplacian and hexplane.",
-}
+  Meets Dynamics Modelling". Learning rates (rates, and .rate of others) are Adam's: they change exponentially from
+  .start to .end, which they reach at step .steps; a parameter with the rate 0 does not change."""
 _METAVARS = {int: "INT", float: "FLOAT", str: "TEXT", bool: "true|false"}
 
 

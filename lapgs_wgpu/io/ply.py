@@ -6,6 +6,7 @@ found by name, since other programs use other orders and add properties.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -148,24 +149,24 @@ def gaussian_names(vertex: Element, known: set[str], path: PathLike) -> list[str
     return names
 
 
-def _check_values(values: Floats, names: list[str], where: str) -> None:
-    """Raise InputError unless all values (N, len(names)) are finite, also after their activations."""
+def problems(values: Floats, names: list[str]) -> Iterator[tuple[NDArray[np.bool_], str]]:
+    """Rows (N,) of values (N, len(names)) that cannot be rendered, and why: those not finite once activated."""
+    finite = np.isfinite(values)
+    for column in np.flatnonzero(~finite.all(axis=0)):
+        yield ~finite[:, column], f"property {names[column]} is NaN or infinite"
+    for name, column in zip(names[-7:-4], values.T[-7:-4], strict=True):
+        yield column > MAX_LOG_SCALE, f"property {name} (log scale) is over {MAX_LOG_SCALE:g}"
+    with np.errstate(over="ignore", under="ignore"):
+        squared_length = np.square(values[:, -4:]).sum(axis=1)
+    unusable = ~np.isfinite(squared_length) | (squared_length == 0)
+    yield unusable, "the quaternion rot_0..3 has a length that cannot be normalised in float32"
 
-    def refuse(bad: NDArray[np.bool_], what: str) -> None:
+
+def _check_values(values: Floats, names: list[str], where: str) -> None:
+    """Raises InputError where rows cannot be rendered."""
+    for bad, what in problems(values, names):
         if bad.any():
             raise InputError(
                 f"{where} {what} in {np.count_nonzero(bad)} of {len(bad)} rows, first in row {np.flatnonzero(bad)[0]} "
                 "(counted from 0); the file is damaged or its training diverged"
             )
-
-    finite = np.isfinite(values)
-    for column in np.flatnonzero(~finite.all(axis=0)):
-        refuse(~finite[:, column], f"property {names[column]} is NaN or infinite")
-    for name, column in zip(names[-7:-4], values.T[-7:-4], strict=True):
-        refuse(column > MAX_LOG_SCALE, f"property {name} (log scale) is over {MAX_LOG_SCALE:g}")
-    with np.errstate(over="ignore", under="ignore"):
-        squared_length = np.square(values[:, -4:]).sum(axis=1)
-    refuse(
-        ~np.isfinite(squared_length) | (squared_length == 0),
-        "the quaternion rot_0..3 has a length that cannot be normalised in float32",
-    )

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.io.ply import MAX_LOG_SCALE, GaussianSnapshot, gaussian_names, snapshot_of, vertex_of
+from lapgs_wgpu.io.ply import GaussianSnapshot, gaussian_names, problems, snapshot_of, vertex_of
 from lapgs_wgpu.io.ply_elements import BAD_SHARE, SH_C0, Floats, PathLike, PlyFile, read_colors
 
 _MOTION = re.compile(  # words of a property's name that speak of time or of motion
@@ -75,7 +75,7 @@ def read_foreign(ply: PlyFile) -> tuple[GaussianSnapshot, dict[str, str]]:
             values[:, :3] = means - offset
         metadata["offset"] = json.dumps(offset.tolist())
         _note(ply.path, f"lies far from the origin: {offset.tolist()} is taken off all coordinates")
-    return snapshot_of(_mended(values, ply.path), names, ply.path), metadata
+    return snapshot_of(_mended(values, names, ply.path), names, ply.path), metadata
 
 
 def _note(path: PathLike, text: str) -> None:
@@ -94,18 +94,16 @@ def _offset(means: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.round(middle, max(0, -int(np.floor(np.log10(extent)))))
 
 
-def _mended(values: Floats, path: PathLike) -> Floats:
+def _mended(values: Floats, names: list[str], path: PathLike) -> Floats:
     """Replace in columns what is legal and cannot be rendered as it is, and leave out rows."""
     opacities, scales, quats = values[:, -8], values[:, -7:-4], values[:, -4:]
     invisible = opacities == -np.inf
     opacities[opacities == np.inf] = _OPAQUE
     scales[scales == -np.inf] = _FLAT
-    largest = np.abs(quats).max(axis=1)
-    unusual = ~((largest > 1e-12) & (largest < 1e12)) & np.isfinite(largest)
-    quats[unusual & (largest > 0)] /= largest[unusual & (largest > 0), None]
-    quats[unusual & (largest == 0)] = [1, 0, 0, 0]
-    bad = ~np.isfinite(values).all(axis=1) & ~invisible
-    bad |= (scales > MAX_LOG_SCALE).any(axis=1) & ~invisible
+    quats[(quats == 0).all(axis=1)] = [1, 0, 0, 0]
+    bad = np.zeros(len(values), bool)
+    for rows, _ in problems(values, names):
+        bad |= rows & ~invisible
     if bad.mean() > BAD_SHARE:
         return values  # refused as a whole
     if bad.any():
