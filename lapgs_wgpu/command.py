@@ -48,11 +48,9 @@ def guarded(name: str, command: Callable[[list[str]], int | None], arguments: li
     except NumericalError as error:
         text, code = str(error), NOT_FINITE
     except BrokenPipeError:  # nobody reads any more what is printed
-        text, code = "", 0
+        code = 0
     except OSError as error:  # such as a full disk, or missing permissions
-        where = f"{error.filename}: " if error.filename is not None else ""
-        text = f"{InputError(f'{where}{error.strerror or error}; check the free space, the path and the permissions')}."
-        code = 2
+        text, code = str(InputError(f"{error}; check the free space, the path and the permissions.")), 2
     except KeyboardInterrupt as error:
         text, code = str(error) or "interrupted.", INTERRUPTED
     if text:

@@ -74,8 +74,6 @@ def checked(kind: Any, value: Any, where: str, least: float = 0) -> Any:
     Numbers must be from `least` to LARGEST_NUMBER, and texts printable.
     """
     origin, parts = typing.get_origin(kind), typing.get_args(kind)
-    if type(None) in parts:
-        return None if value is None else checked(parts[0], value, where, least)
     if origin is Literal:
         if value in parts:
             return value
@@ -87,11 +85,7 @@ def checked(kind: Any, value: Any, where: str, least: float = 0) -> Any:
             raise InputError(f"{where} must be {'a list' if many else f'{len(parts)} numbers'}, got {shown(value)}.")
         kinds = parts[:1] * len(value) if many else parts
         return tuple(checked(part, entry, where, least) for part, entry in zip(kinds, value, strict=True))
-    if origin is dict and isinstance(value, dict):
-        return {key: checked(parts[1], entry, f"{where}.{key}", least) for key, entry in value.items()}
-    if kind is Any:
-        return value
-    if type(value) is not kind and not (kind is float and type(value) is int):
+    if type(value) is not (origin or kind) and not (kind is float and type(value) is int):
         raise InputError(f"{where} must be {_KIND_NAMES.get(kind, 'a table')}, got {shown(value)}.")
     if kind in (int, float) and not least <= value <= LARGEST_NUMBER:
         raise InputError(f"{where} must lie between {least:g} and {LARGEST_NUMBER}, got {shown(value)}.")

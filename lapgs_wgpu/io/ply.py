@@ -6,7 +6,7 @@ found by name, since other programs use other orders and add properties.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,26 +54,32 @@ def _names(rest: int) -> list[str]:
 _WRITTEN_NAMES = [*_names(0)[:3], "nx", "ny", "nz", *_names(45)[3:]]
 
 
-def write_ply(path: PathLike, still: GaussianSnapshot, *, antialiased: bool = False) -> None:
+def write_ply(
+    path: PathLike,
+    still: GaussianSnapshot,
+    *,
+    antialiased: bool = False,
+    trailer: str = "",
+    buffers: Sequence[bytes | memoryview] = (),
+) -> None:
     """Write Gaussians with exactly the 62 properties of 3DGS, SH padded with zeros to degree 3. Atomic.
 
-    antialiased: adds the comment by which Brush and others tell how the Gaussians are drawn. Raises InputError when
-    the file cannot be written or a value could not be read back.
+    antialiased: adds the comment by which Brush and others tell how Gaussians are drawn. trailer: lines that declare
+    a further element, whose rows are the buffers. Raises InputError when the file cannot be written or a value could
+    not be read back.
     """
-    rows = vertex_rows(still, path)
-    with atomic_write(path) as file:
-        file.write(ply_header(len(still), f"comment {ANTIALIASED}\n" if antialiased else ""))
-        file.write(rows.data)
-
-
-def ply_header(count: int, trailer: str = "") -> bytes:
-    """The header for `count` Gaussians. trailer: lines of comments and further elements."""
+    rows = _vertex_rows(still, path)
     properties = "".join(f"property float {name}\n" for name in _WRITTEN_NAMES)
+    comment = f"comment {ANTIALIASED}\n" if antialiased else ""
     # Some viewers expect the count on the third line.
-    return f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}{trailer}end_header\n".encode()
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(still)}\n{properties}{comment}{trailer}"
+    with atomic_write(path) as file:
+        file.write(f"{header}end_header\n".encode())
+        for buffer in (rows.data, *buffers):
+            file.write(buffer)
 
 
-def vertex_rows(still: GaussianSnapshot, path: PathLike) -> Floats:
+def _vertex_rows(still: GaussianSnapshot, path: PathLike) -> Floats:
     """(N, 62) little-endian rows as in 3DGS. path: for errors. Raises InputError if they could not be read back."""
     if len(still) == 0:
         raise InputError(f"{path}: not written, because it would hold 0 Gaussians; at least 1 is needed")
