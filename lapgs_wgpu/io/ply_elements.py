@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -79,31 +80,24 @@ class PlyFile(NamedTuple):
         if element.count == 0:
             return np.empty((0, len(names)), dtype)
         with np.errstate(all="ignore"):  # a double beyond float32 becomes infinite, which callers report
-            if self.encoding == "ascii":
-                known = list(element.properties)
-                return self._text_rows(element)[:, [known.index(name) for name in names]].astype(dtype)
-            self.file.seek(element.offset)
-            rows = np.fromfile(self.file, element.row, element.count)
+            rows = self._rows(element)
             if len(rows) < element.count:
-                raise InputError(f"{self.path}: shrank while it was read, to {len(rows)} of {element.count} rows.")
+                raise InputError(f"{self.path}: has {len(rows)} of the {element.count} rows declared; it is cut off.")
             values: NDArray[Any] = structured_to_unstructured(rows[names], dtype, copy=True)
             return values
 
-    def _text_rows(self, element: Element) -> NDArray[np.float64]:
+    def _rows(self, element: Element) -> NDArray[Any]:
+        if self.encoding != "ascii":
+            self.file.seek(element.offset)
+            return np.fromfile(self.file, element.row, element.count)
         self.file.seek(self.header_bytes)
-        shape = element.count, len(element.properties)
+        row = np.dtype([(name, np.float64) for name in element.properties])
+        options: dict[str, Any] = {"comments": None, "ndmin": 1, "encoding": "latin1"}
         try:
-            table = np.loadtxt(
-                self.file, comments=None, skiprows=element.offset, max_rows=shape[0], ndmin=2, encoding="latin1"
-            )
-            if table.shape != shape:
-                raise ValueError(f"{table.shape} are there")
+            with warnings.catch_warnings(action="ignore"):  # of lines without numbers
+                return np.loadtxt(self.file, row, skiprows=element.offset, max_rows=element.count, **options)
         except ValueError as error:
-            raise InputError(
-                f"{self.path}: its lines do not hold the declared {shape} rows and numbers in each ({error}); it is "
-                "damaged."
-            ) from None
-        return table
+            raise InputError(f"{self.path}: its lines do not hold the declared numbers ({error}).") from None
 
 
 @contextmanager
