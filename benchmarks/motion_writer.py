@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from raytrace import SAMPLES, Hits, combine, pixel_means, to_bytes, to_pixels
 
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.io.dataclass_table import build_dataclass, field_types, from_text
+from lapgs_wgpu.io.dataclass_table import build_dataclass
 from lapgs_wgpu.splat.camera import Camera
 
 FORMAT = "lapgs-objects 1"
@@ -32,9 +32,8 @@ TABLE = Path(__file__).parents[1] / "docs" / "tables" / "motion.toml"
 
 def parse_motion(name: str) -> MotionScene:
     """The scene that KEY=VALUE,... names. Raises InputError."""
-    types = field_types(MotionScene)
     pairs = [part.partition("=") for part in name.split(",") if part]
-    return build_dataclass(MotionScene, {key: from_text(value, types.get(key)) for key, _, value in pairs}, name)
+    return build_dataclass(MotionScene, {key: value for key, _, value in pairs}, name)
 
 
 def write_motion(

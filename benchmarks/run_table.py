@@ -65,17 +65,17 @@ class _SpecFile(Options):
     seeds: tuple[int, ...] = option("seeds of each row")
     scenes: dict[str, Any] = option("name -> folder, or a table with the key folder and keys of the configuration")
     rows: dict[str, Any] = option("name -> method, ablate, scenes, seeds and keys of the configuration")
-    common: dict[str, Any] | None = option("keys of the configuration, for all runs", None)
 
 
 def read_spec(path: Path) -> list[Run]:
     """Read the file that defines a table. Returns its runs, scene by scene. Raises InputError before any training where
     a name, a key or a value of any run is not valid."""
-    spec = build_dataclass(_SpecFile, read_toml(path), str(path))
+    table = read_toml(path)
+    common = _dotted(table.pop("common", {}), f"{path}: common")  # keys of the configuration, for all runs
+    spec = build_dataclass(_SpecFile, table, str(path))
     for name in (*spec.scenes, *spec.rows):
         if not _NAME.fullmatch(name):
             raise InputError(f"{path}: {name!r} must be a name of letters, digits, spaces and . + = _ - only.")
-    common = _dotted(spec.common or {}, f"{path}: common")
     runs = []
     for scene, value in spec.scenes.items():
         of_scene = _dotted({"folder": value} if isinstance(value, str) else value, f"{path}: scenes.{scene}")

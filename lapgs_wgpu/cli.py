@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import sys
 import typing
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from lapgs_wgpu.command import guarded, print_devices
@@ -20,6 +22,7 @@ if typing.TYPE_CHECKING:
     from lapgs_wgpu.train.config import Config
     from lapgs_wgpu.train.lpips import Lpips
 
+Table = dict[str, typing.Any]
 EVAL_KEYS = ("data.path", "data.movers", "data.background", "data.cache_gb")  # keys that can be given with --eval
 RESUME_KEYS = ("data.path", "data.masks", "data.cache_gb")  # and with --resume: where the capture is now
 
@@ -36,13 +39,14 @@ def _train(arguments: list[str]) -> None:
     options = parse_options(arguments)
     from lapgs_wgpu.gpu.device import open_device  # what follows needs torch, which takes seconds to import
     from lapgs_wgpu.run import train
+    from lapgs_wgpu.train.lpips import Lpips
     from lapgs_wgpu.train.run_folder import check_run_folder, result_text
 
     overrides = {key: options[key] for key in config_keys() if key in options}
+    lpips = Lpips(Path(options["lpips_weights"])) if options["lpips_weights"] else None
     if options["eval"]:
-        _evaluate(Path(options["eval"]), options, overrides)
+        _evaluate(Path(options["eval"]), options, overrides, lpips)
         return
-    lpips = _lpips(options)
     watch = None
     if options["view"]:
         from lapgs_wgpu.viewer import live
@@ -68,88 +72,64 @@ def _train(arguments: list[str]) -> None:
     say(result_text(out))
 
 
-def _resume(
-    run: Path,
-    options: dict[str, typing.Any],
-    overrides: dict[str, typing.Any],
-    watch: Watch | None,
-    lpips: Lpips | None,
-) -> None:
+def _resume(run: Path, options: Table, overrides: Table, watch: Watch | None, lpips: Lpips | None) -> None:
     from lapgs_wgpu.gpu.device import open_device
     from lapgs_wgpu.run import resume
-    from lapgs_wgpu.train.run_folder import changes_since, check_same_data, result_text
+    from lapgs_wgpu.train.run_folder import changes_since, result_text
 
-    _check_alone("resume", options, [key for key in overrides if key not in RESUME_KEYS], allowed=("view",))
-    config = _config_of(run, overrides, "--resume needs the folder of a run")
+    _check_alone("resume", options, overrides.keys() - RESUME_KEYS, allowed=("view",))
+    config = _config_of(run, overrides)
     device = open_device(options["device"])
-    config, dataset = _open_data(config, run.parent)
-    if "data.path" in overrides:
-        check_same_data(run, config.data.path, dataset)
+    config, dataset = _open_data(config, run.parent, run if "data.path" in overrides else None)
     for what, before, now in changes_since(run, config, device, dataset):
         print(f"lapgs-train: {what} was {before} when {run} began and is {now}: bits may differ.", file=sys.stderr)
     resume(config, dataset, run, device=device, watch=watch, lpips=lpips)
     say(result_text(run))
 
 
-def _evaluate(run: Path, options: dict[str, typing.Any], overrides: dict[str, typing.Any]) -> None:
+def _evaluate(run: Path, options: Table, overrides: Table, lpips: Lpips | None) -> None:
     from lapgs_wgpu.data import load_dataset
     from lapgs_wgpu.gpu.device import open_device
     from lapgs_wgpu.io.safe_json_toml import read_json
     from lapgs_wgpu.motion.scene import load
     from lapgs_wgpu.run import evaluate_run
-    from lapgs_wgpu.train.run_folder import check_same_data, result_text
+    from lapgs_wgpu.train.run_folder import result_text
 
-    _check_alone("eval", options, [key for key in overrides if key not in EVAL_KEYS])
-    lpips = _lpips(options)
-    if not (run / "checkpoint.ply").is_file():
-        raise InputError(f"{run / 'checkpoint.ply'} does not exist; --eval needs the folder of a finished run.")
-    overrides["data.masks"] = ""  # masks are for the training alone
+    _check_alone("eval", options, overrides.keys() - EVAL_KEYS)
     movers = overrides.pop("data.movers", None)
-    config = _config_of(run, overrides, "--eval needs the folder of a finished run")
-    device = open_device(options["device"])
-    scene = load(run / "checkpoint.ply", device)
-    config, dataset = _open_data(config, run.parent)
-    if "data.path" in overrides:
-        check_same_data(run, config.data.path, dataset)
+    config = _config_of(run, {**overrides, "data.masks": ""})  # masks are for the training alone
+    scene = load(run / "checkpoint.ply", open_device(options["device"]))
+    config, dataset = _open_data(config, run.parent, run if "data.path" in overrides else None)
     if movers is not None:  # the world's coordinates follow the masks of the run
         given = load_dataset(config.data.path, image_size=config.data.size or None, movers=movers).test
         pairs = zip(dataset.test, given, strict=True)
         test = tuple(dataclasses.replace(view, moving=other.moving) for view, other in pairs)
         dataset = dataclasses.replace(dataset, test=test)
-    try:
-        training = read_json(run / "metrics.json")["training"]
-    except (InputError, KeyError, TypeError):
-        step = scene.metadata.get("step", "")
-        training = {"steps": int(step[:15]) if step.isascii() and step.isdigit() else 0}
-    steps = config.schedule.steps
-    done = training.get("steps") if isinstance(training, dict) else None
-    if isinstance(done, int) and done < steps:
+    step = scene.metadata.get("step", "")
+    done, steps = int(step) if re.fullmatch("[0-9]{1,15}", step) else 0, config.schedule.steps
+    if done < steps:
         print(f"note: {run} was interrupted; its checkpoint is of step {done} of {steps}.", file=sys.stderr)
+    training: Table = {"steps": done}
+    with suppress(ValueError, KeyError, TypeError):  # InputError is a ValueError
+        training |= read_json(run / "metrics.json")["training"]
     evaluate_run(run, scene, dataset, config.data, training, lpips)
     say(result_text(run))
 
 
-def _check_alone(option: str, options: dict[str, typing.Any], keys: Sequence[str], allowed: Sequence[str] = ()) -> None:
+def _check_alone(option: str, options: Table, keys: Collection[str], allowed: Collection[str] = ()) -> None:
     """Raises InputError where --resume or --eval was given with another option that starts a training, or with keys of
     the configuration."""
     starting = ("preset", "field", "ablate", "out", "resume", "overwrite", "view")
     words = [f"--{name}" for name in starting if options[name] and name not in (option, *allowed)]
-    for word in [*words, *(f"--{key}" for key in keys)]:
+    for word in [*words, *(f"--{key}" for key in sorted(keys))]:
         word = repr(options["preset"]) if word == "--preset" else word
         raise InputError(f"--{option} takes the configuration of the run as it is, so {word} cannot be given.")
 
 
-def _lpips(options: dict[str, typing.Any]) -> Lpips | None:
-    """LPIPS with the weights that were given. Raises InputError."""
-    from lapgs_wgpu.train.lpips import Lpips
-
-    return Lpips(Path(options["lpips_weights"])) if options["lpips_weights"] else None
-
-
-def _config_of(run: Path, overrides: dict[str, typing.Any], advice: str) -> Config:
+def _config_of(run: Path, overrides: Table) -> Config:
     """The configuration of a run. Raises InputError where it or the run's capture is gone."""
     if not (run / "config.toml").is_file():
-        raise InputError(f"{run / 'config.toml'} does not exist; {advice}.")
+        raise InputError(f"{run / 'config.toml'} does not exist; --resume and --eval need the folder of a run.")
     config = load_config(str(run / "config.toml"), overrides)
     if config.data.path != "synthetic" and not Path(config.data.path).exists():
         raise InputError(
@@ -159,12 +139,19 @@ def _config_of(run: Path, overrides: dict[str, typing.Any], advice: str) -> Conf
     return config
 
 
-def _open_data(config: Config, parent: Path) -> tuple[Config, Dataset]:
-    """The dataset, and the configuration with its folder. parent: folder for the built-in scene."""
+def _open_data(config: Config, parent: Path, run: Path | None = None) -> tuple[Config, Dataset]:
+    """The dataset, and the configuration with its folder.
+
+    parent: folder for the built-in scene. run: whose capture it must be. Raises InputError.
+    """
+    from lapgs_wgpu.train.run_folder import check_same_data
     from lapgs_wgpu.train.setup import open_dataset, resolve_data
 
     config = resolve_data(config, parent)
-    return config, open_dataset(config)
+    dataset = open_dataset(config)
+    if run is not None:
+        check_same_data(run, config.data.path, dataset)
+    return config, dataset
 
 
 if __name__ == "__main__":

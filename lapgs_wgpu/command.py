@@ -1,6 +1,7 @@
 """What all commands share. Users' mistakes end in one sentence on stderr and exit code 2.
 
-3 means no adapter, 4 that device or memory gave out, 5 values that are not finite in a training.
+3 means no adapter, 4 that device or memory gave out, 5 values that are not finite in a training, 130 (the shell's code)
+that Ctrl-C ended the command.
 """
 
 from __future__ import annotations
@@ -23,8 +24,6 @@ DEVICE_HELP = (
     "otherwise the first in the list of lapgs-train --list-devices]"
 )
 LIST_DEVICES_HELP = "list the graphics adapters and exit; the first one is the default unless LAPGS_DEVICE is set"
-OUT_OF_DEVICE, NOT_FINITE = 4, 5
-INTERRUPTED = 130  # the shell's code for a process that Ctrl-C ended
 
 
 def guarded(name: str, command: Callable[[list[str]], int | None], arguments: list[str]) -> int:
@@ -40,21 +39,19 @@ def guarded(name: str, command: Callable[[list[str]], int | None], arguments: li
     except InputError as error:
         text, code = str(error), 2
     except (DeviceError, MemoryError) as error:
-        text, code = str(error) or "out of memory.", OUT_OF_DEVICE
+        text, code = str(error) or "out of memory.", 4
     except RuntimeError as error:
         if "allocate" not in str(error):  # torch's error for exhausted memory
             raise
-        text, code = f"out of memory ({str(error).splitlines()[0]})", OUT_OF_DEVICE
+        text, code = f"out of memory ({str(error).splitlines()[0]})", 4
     except NumericalError as error:
-        text, code = str(error), NOT_FINITE
+        text, code = str(error), 5
     except BrokenPipeError:  # nobody reads any more what is printed
-        text, code = "", 0
+        code = 0
     except OSError as error:  # such as a full disk, or missing permissions
-        where = f"{error.filename}: " if error.filename is not None else ""
-        text = f"{InputError(f'{where}{error.strerror or error}; check the free space, the path and the permissions')}."
-        code = 2
+        text, code = str(InputError(f"{error}; check the free space, the path and the permissions.")), 2
     except KeyboardInterrupt as error:
-        text, code = str(error) or "interrupted.", INTERRUPTED
+        text, code = str(error) or "interrupted.", 130
     if text:
         with suppress(OSError):  # the terminal may be gone
             print(f"{name}: {text}", file=sys.stderr)

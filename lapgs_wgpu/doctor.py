@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,20 +18,14 @@ from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.gpu.probe_subgroup import subgroup_size
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.constants import CONSTANTS
-from lapgs_wgpu.splat.rasterize import Rendering, rasterize, rasterizer_of
+from lapgs_wgpu.splat.rasterize import rasterize, rasterizer_of
 from lapgs_wgpu.splat.rotation import rotation_matrices
 
 COUNT = 40  # Gaussians
 FOCAL, WIDTH, HEIGHT = 64.0, 70, 50  # pixels
+# The largest errors that pass: of colors and depths, and of the image's gradients by each kind of parameter.
+ALLOWED = {"image": 1e-5, "gradient of the image": 1e-4}
 BACKGROUND = torch.tensor([0.2, 0.1, 0.6], dtype=torch.float64)
-
-
-class Check(NamedTuple):
-    """run: returns the largest error. allowed: the largest error that passes."""
-
-    name: str
-    run: Callable[[Device], float]
-    allowed: float
 
 
 def stacked_gaussians() -> dict[str, Tensor]:
@@ -73,34 +67,20 @@ def known_image(gaussians: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
     return image + transmittance[..., None] * BACKGROUND, depth
 
 
-def draw(device: Device) -> tuple[dict[str, Tensor], Rendering]:
-    """The stacked Gaussians in float32, which require gradients, and their rendering."""
-    tensors = {name: value.detach().float().requires_grad_() for name, value in stacked_gaussians().items()}
-    K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+def errors(device: Device) -> Iterator[float]:
+    """The largest errors of an adapter, in the order of ALLOWED, each as it has been computed."""
+    exact = stacked_gaussians()
+    tensors = {name: value.detach().float().requires_grad_() for name, value in exact.items()}
     gaussians: dict[str, Any] = dict(tensors)  # arguments of rasterize by name
+    K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
     camera = Camera(K, np.eye(4), WIDTH, HEIGHT)
-    return tensors, rasterize(**gaussians, camera=camera, background=BACKGROUND.float(), device=device)
-
-
-def image(device: Device) -> float:
-    """The error of colors and depths, that of depths relative to the largest."""
-    expected, depth = known_image(stacked_gaussians())
-    _, rendering = draw(device)
-    return max(relative_error(rendering.image, expected), relative_error(rendering.depth, depth))
-
-
-def image_gradient(device: Device) -> float:
-    """The error of the image's gradients, each relative to the largest of its kind."""
+    rendering = rasterize(**gaussians, camera=camera, background=BACKGROUND.float(), device=device)
+    image, depth = known_image(exact)
+    yield max(relative_error(rendering.image, image), relative_error(rendering.depth, depth))
     weights = torch.randn(HEIGHT, WIDTH, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    gaussians, (tensors, rendering) = stacked_gaussians(), draw(device)
-    (rendering.image * weights.float()).sum().backward()
-    (known_image(gaussians)[0] * weights).sum().backward()
-    return max(relative_error(_gradient(tensors[name]), _gradient(gaussians[name])) for name in gaussians)
-
-
-def _gradient(tensor: Tensor) -> Tensor:
-    assert tensor.grad is not None
-    return tensor.grad
+    computed = torch.autograd.grad((rendering.image * weights.float()).sum(), list(tensors.values()))
+    expected = torch.autograd.grad((image * weights).sum(), list(exact.values()))
+    yield max(map(relative_error, computed, expected))
 
 
 def relative_error(computed: Tensor, expected: Tensor) -> float:
@@ -109,33 +89,27 @@ def relative_error(computed: Tensor, expected: Tensor) -> float:
     return error if math.isfinite(error) else math.inf
 
 
-CHECKS = (Check("image", image, 1e-5), Check("gradient of the image", image_gradient, 1e-4))
-
-
 def self_test(name: str | None) -> int:
     """Run the checks on an adapter (`open_device`). Returns 1 if one failed. Raises NoAdapterError."""
     device = open_device(name)
     print(f"### Self-test on {device.info.name} ({device.info.backend})\n", flush=True)
-    failed = 0
-    for check in CHECKS:
-        print(f"- {check.name}: ", end="", flush=True)  # which tells where a driver crashed
+    found, passed = errors(device), 0
+    for check, allowed in ALLOWED.items():
+        print(f"- {check}: ", end="", flush=True)  # which tells where a driver crashed
         start = time.perf_counter()
         try:
-            error = check.run(device)
+            error = next(found)
         except Exception as problem:
-            failed += 1
             print(f"**FAILED**, {type(problem).__name__}: {' '.join(str(problem).split())[:300]}", flush=True)
-            continue
-        passed = error <= check.allowed
-        failed += not passed
-        result = "ok" if passed else "**FAILED**"
+            break
+        passed += error <= allowed
+        result = "ok" if error <= allowed else "**FAILED**"
         seconds = time.perf_counter() - start
-        print(f"{result}, error {error:.2g} (allowed {check.allowed:g}), {seconds:.1f} s with compilation", flush=True)
+        print(f"{result}, error {error:.2g} (allowed {allowed:g}), {seconds:.1f} s with compilation", flush=True)
     config = rasterizer_of(device).config  # after a drawing, which may have turned subgroups off
     print(
         f"- subgroups of {subgroup_size(device)} lanes, {'used' if config.subgroups else 'not used'}; tiles of "
-        f"{config.tile_width}x{config.tile_height} pixels\n\n"
-        f"{len(CHECKS) - failed} of {len(CHECKS)} checks passed.",
+        f"{config.tile_width}x{config.tile_height} pixels\n\n{passed} of {len(ALLOWED)} checks passed.",
         flush=True,
     )
-    return 1 if failed else 0
+    return int(passed < len(ALLOWED))

@@ -7,7 +7,6 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from types import TracebackType
 from typing import TextIO, TypeVar
 
 T = TypeVar("T")
@@ -27,9 +26,7 @@ class Progress:
     def __enter__(self) -> Progress:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._stream.isatty():
             self._write("\n")
 
@@ -41,12 +38,12 @@ class Progress:
         """`done` steps are done. text: makes the line, by default the count and the time left at the mean rate since
         the first call."""
         self._done = done
-        now, on_terminal = time.perf_counter(), self._stream.isatty()
+        now = time.perf_counter()
         self._first = self._first or (done, now)
         if done == self._total or self.due:
             self._shown = now
             line = text() if text else self._line(now)
-            self._write(in_place(line) if on_terminal else f"{line}\n")
+            self._write(in_place(line) if self._stream.isatty() else f"{line}\n")
 
     @property
     def due(self) -> bool:

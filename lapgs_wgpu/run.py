@@ -23,23 +23,13 @@ from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.progress import Progress, say
 from lapgs_wgpu.stop_signals import stop_requests
+from lapgs_wgpu.train import run_folder
 from lapgs_wgpu.train.config import Config, DataConfig
 from lapgs_wgpu.train.evaluate import evaluate, write_metrics
 from lapgs_wgpu.train.host import keep_freed_memory, return_freed_memory
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.lpips import Lpips
 from lapgs_wgpu.train.parts import Parts
-from lapgs_wgpu.train.run_folder import (
-    STATE,
-    check_run_folder,
-    check_state,
-    drop_states,
-    has_state,
-    load_state,
-    note_paths,
-    save_state,
-    start_run_folder,
-)
 from lapgs_wgpu.train.step_result import StepResult
 from lapgs_wgpu.train.trainer import Trainer
 
@@ -77,11 +67,11 @@ def train(
         raise InputError(f"{dataset.name} has no test view, by which a run is measured; add images to the capture.")
     found = check_times(dataset, moving=config.field.kind != "static") + check_spacing(dataset)
     found += check_in_view(dataset, first_points(dataset, PROBES, config.points.box, config.seed)[0])
-    check_run_folder(out, overwrite=overwrite)
+    run_folder.check_run_folder(out, overwrite=overwrite)
     keep_freed_memory()
     device = device or open_device()
     with locked_folder(out):
-        check_run_folder(out, overwrite=overwrite)  # again: another training may have written it meanwhile
+        run_folder.check_run_folder(out, overwrite=overwrite)  # again: another training may have written it meanwhile
         if dataset.summary:
             say(f"capture: {dataset.summary}")
         for warning in (*dataset.warnings, *found):
@@ -89,7 +79,7 @@ def train(
         if dataset.normalization is not None:
             say(f"normalization: {dataset.normalization}")
         training = start_training(config, dataset, device, parts=parts)
-        start_run_folder(out, training.user_config, training.scene.device, dataset)
+        run_folder.start_run_folder(out, training.user_config, training.scene.device, dataset)
         if training.discovery is not None:
             say(f"discovery: {training.discovery}; {training.discovery_seconds:.0f} s")
         say(f"steps: {training.steps_are}")
@@ -109,23 +99,24 @@ def resume(
     """Go on with an interrupted training of this configuration and dataset in its run folder, from its last saved
     state, or from the start where it has none. Otherwise as `train`."""
     out = Path(out)
-    if (out / "metrics.json").exists() and not has_state(out):  # --eval measures interrupted runs, too
+    if (out / "metrics.json").exists() and not run_folder.has_state(out):  # --eval measures interrupted runs, too
         raise InputError(f"{out} is finished: there is nothing to resume.")
     keep_freed_memory()
     device = device or open_device()
     with locked_folder(out):
-        state = load_state(out)
+        state = run_folder.load_state(out)
         if state is None and (out / "checkpoint.ply").exists():
             raise InputError(
-                f"{out} holds a checkpoint, but no state to go on from ({STATE}); copy that file, too, or train anew."
+                f"{out} holds a checkpoint, but no state to go on from ({run_folder.STATE}); copy that file, too, or "
+                "train anew."
             )
-        note_paths(out, config)
+        run_folder.note_paths(out, config)
         if state is None:
             training = start_training(config, dataset, device, parts=parts)
         else:
             training = Trainer(config, dataset, device, parts=parts)
             try:
-                check_state(state, views=len(dataset.train), steps=config.schedule.steps)
+                run_folder.check_state(state, views=len(dataset.train), steps=config.schedule.steps)
                 training.restore(state)
             except (IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
                 reason = f"{type(error).__name__}: {error}".splitlines()[0]
@@ -155,11 +146,7 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
     with log, stop_requests() as interrupted:
         if training.discovery is not None:
             log.discovered(training.discovery)
-        training.callbacks.append(log.after_step)
-        if config.eval.interval:
-            training.callbacks.append(partial(_log_psnr, log))
-        if config.schedule.save_interval:
-            training.callbacks.append(partial(_save_now_and_then, out))
+        training.callbacks.append(partial(_after_step, out, log))
         steps = _steps(training, out, interrupted)
         if watch is not None:
             watch(out / "checkpoint.ply", scene, training.initial_view, steps)
@@ -179,7 +166,7 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
             log.tell(training.timing.summary())
 
     return_freed_memory()
-    save_state(out, training.state())
+    run_folder.save_state(out, training.state())
     training.save(out / "checkpoint.ply")
     if done < all_steps:
         raise KeyboardInterrupt(
@@ -193,22 +180,22 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
             "stopped after the last step, while the test views were measured; "
             f"lapgs-train --resume {quoted(out)} goes on."
         ) from None
-    drop_states(out)
+    run_folder.drop_states(out)
     return scene
 
 
-def _log_psnr(log: Log, training: Trainer, result: StepResult) -> None:
-    """Log the mean PSNR of the validation views, or of some training views, every eval.interval steps."""
-    if result.step % training.config.eval.interval == 0:
+def _after_step(out: Path, log: Log, training: Trainer, result: StepResult) -> None:
+    """Log a step; at their intervals, log the mean PSNR of the validation views, or of some training views, and save
+    the state."""
+    log.after_step(training, result)
+    eval_interval, save_interval = training.config.eval.interval, training.config.schedule.save_interval
+    if eval_interval and result.step % eval_interval == 0:
         start, data = time.perf_counter(), training.dataset
         name, views = ("val", data.val) if data.val else ("train", spread_views(data.train, TRAINING_VIEWS))
         psnr = training.psnr(views)
         log.evaluated(result.step, psnr, name, time.perf_counter() - start)
-
-
-def _save_now_and_then(out: Path, training: Trainer, result: StepResult) -> None:
-    if result.step % training.config.schedule.save_interval == 0 and result.step < result.steps:
-        save_state(out, training.state())
+    if save_interval and result.step % save_interval == 0 and result.step < result.steps:
+        run_folder.save_state(out, training.state())
 
 
 def _steps(training: Trainer, out: Path, interrupted: threading.Event) -> Iterator[StepResult]:
@@ -217,11 +204,12 @@ def _steps(training: Trainer, out: Path, interrupted: threading.Event) -> Iterat
     try:
         while training.done < last and not interrupted.is_set():
             yield training.step()
-    except (DeviceError, NumericalError, MemoryError) as error:
-        kind = MemoryError if not isinstance(error, DeviceError | NumericalError) else type(error)  # numpy has its own
-        raise kind(f"{error}{_saved(training, out)}") from error
-    except Exception:
-        _saved(training, out)
+    except Exception as error:
+        told = _saved(training, out)
+        if isinstance(error, DeviceError | NumericalError):
+            raise type(error)(f"{error}{told}") from error
+        if isinstance(error, MemoryError):  # numpy has its own
+            raise MemoryError(f"{error}{told}") from error
         raise
     finally:
         training.close()
@@ -232,11 +220,11 @@ def _saved(training: Trainer, out: Path) -> str:
     if training.whole and training.done:
         with suppress(DeviceError):  # which has the newest parameters, and gives nothing any more
             try:
-                save_state(out, training.state())
+                run_folder.save_state(out, training.state())
             except InputError as error:  # no second trouble instead of the first
                 return f" (and {error})"
             return f"; stopped after step {training.done}, from which lapgs-train --resume {quoted(out)} goes on."
-    if has_state(out):
+    if run_folder.has_state(out):
         return f"; lapgs-train --resume {quoted(out)} goes on from the state that was saved last."
     return "; nothing was saved yet."
 
@@ -248,24 +236,15 @@ def evaluate_run(
     data: DataConfig,
     training: dict[str, Any],
     lpips: Lpips | None = None,
-) -> dict[str, object]:
-    """Evaluate on the test views; write metrics.json and eval/ of a run folder; returns the metrics.
+) -> None:
+    """Evaluate on the test views; write metrics.json and eval/ of a run folder.
 
-    data: says on which background. lpips: as for `evaluate`.
+    data: says on which background. training: goes into metrics.json as it is. lpips: as for `evaluate`.
     """
     folder = out / "eval"
     if folder.is_symlink():
         raise InputError(f"{folder} is a link, and images are written into the run's own folder only; remove it.")
     folder.mkdir(exist_ok=True)
     with Progress(len(dataset.test), "test views measured") as progress:
-        metrics = evaluate(
-            scene,
-            dataset.test,
-            data.background,
-            folder,
-            lpips=lpips,
-            progress=progress,
-        )
-    metrics["training"] = training
-    write_metrics(out, metrics)
-    return metrics
+        metrics = evaluate(scene, dataset.test, data.background, folder, lpips=lpips, progress=progress)
+    write_metrics(out, {**metrics, "training": training})

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
+import json
 import textwrap
 import typing
-from collections.abc import Iterator
 
 from lapgs_wgpu.command import DEVICE_HELP, LIST_DEVICES_HELP, HelpFormatter, Parser
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.io.dataclass_table import did_you_mean, field_types
+from lapgs_wgpu.io.dataclass_table import did_you_mean
 from lapgs_wgpu.train.presets import ABLATIONS, config_keys, load_config, preset_names
 
 # Short names for the keys that are given most often.
@@ -42,22 +41,9 @@ keys of the configuration [in brackets: values of the preset {preset}]:
   "World units" are those of the scene after it was moved and scaled into the cube from -1.3 to 1.3; D-NeRF scenes keep
   their coordinates. "The cameras' extent" is 1.1 times the largest distance of a training camera from their mean. "With
   discovery" means: if the training starts with motion discovery (discovery.enabled). "The paper" is "Laplacian Analysis
-  Meets Dynamics Modelling"."""
-# What the keys of a section have in common.
-SECTIONS = {
-    "field": "static and temporal have four keys each: .levels, the number of resolution levels; .base and .finest, "
-    "three numbers each, the resolution of the coarsest and of the finest level along each axis; .table_log2, log2 of "
-    "the largest number of entries of a level. planes has .features (per plane and level), .space and .time "
-    "(resolution of the coarsest level) and .levels, each of which doubles .space.",
-    "rates": "Learning rates of Adam; 0: the parameter does not change. KEY is start, end or steps: the rate changes "
-    "exponentially from .start to .end, which it reaches at step .steps.",
-    "acceleration": "The acceleration loss, which makes motion even.",
-    "cameras": "The keys of rate are those of rates.",
-    "exposure": "The keys of rate are those of rates.",
-    "smoothness": "The smoothness loss of the fields grid4d, laplacian and hexplane.",
-}
+  Meets Dynamics Modelling". Learning rates (rates, and .rate of others) are Adam's: they change exponentially from
+  .start to .end, which they reach at step .steps; a parameter with the rate 0 does not change."""
 _METAVARS = {int: "INT", float: "FLOAT", str: "TEXT", bool: "true|false"}
-_WIDTH, _COLUMN = 120, 42  # of the list of keys: its lines, and where the texts begin
 
 
 def parse_options(arguments: list[str]) -> dict[str, typing.Any]:
@@ -101,9 +87,8 @@ def parse_options(arguments: list[str]) -> dict[str, typing.Any]:
         "a .safetensors file (docs/metrics.md)")
     # fmt: on
     for name, kind in config_keys().items():
-        words = [SHORTCUTS[name]] if name in SHORTCUTS else []
         entries = len(typing.get_args(kind)) if typing.get_origin(kind) is tuple else None
-        add(*words, f"--{name}", dest=name, nargs=entries, default=argparse.SUPPRESS, help=argparse.SUPPRESS)
+        add(*_words(name), dest=name, nargs=entries, default=argparse.SUPPRESS, help=argparse.SUPPRESS)
     known, unknown = parser.parse_known_args(arguments)
     if unknown:
         word = unknown[0].split("=")[0]
@@ -114,46 +99,34 @@ def parse_options(arguments: list[str]) -> dict[str, typing.Any]:
 
 
 def keys_help(preset: str) -> str:
-    """The list of the keys of the configuration, by section, with the values of a preset."""
-    lines = [KEYS.format(preset=preset)]
-    config = load_config(preset)
-    single = [
-        field for field in dataclasses.fields(config) if not dataclasses.is_dataclass(getattr(config, field.name))
-    ]
-    lines += ["", *(line for field in single for line in _key_help(config, field, ""))]
-    for field in dataclasses.fields(config):
-        section = getattr(config, field.name)
-        if dataclasses.is_dataclass(section):
-            lines += ["", f"{field.name}:"]
-            lines += textwrap.wrap(SECTIONS.get(field.name, ""), _WIDTH, initial_indent="  ", subsequent_indent="  ")
-            for key in dataclasses.fields(section):
-                lines += _key_help(section, key, f"{field.name}.")
+    """The list of the keys of the configuration, those of no section first, with the values of a preset."""
+    config, lines, section = load_config(preset), [KEYS.format(preset=preset)], None
+    for name, kind in sorted(config_keys().items(), key=lambda key: "." in key[0]):
+        *sections, _ = name.split(".")
+        if sections[:1] != section:
+            section = sections[:1]
+            lines.append("")
+        value: typing.Any = config
+        texts = []
+        for part in name.split("."):
+            texts.append(value.__dataclass_fields__[part].metadata.get("help"))
+            value = getattr(value, part)
+        entries = value if isinstance(value, tuple) else (value,)
+        shown = " ".join(entry if isinstance(entry, str) else json.dumps(entry) for entry in entries)
+        option = f"{', '.join(_words(name))} {_metavar(kind)}"
+        text = ": ".join(filter(None, texts)) + (f" [{shown}]" if shown else "")
+        first, others = f"  {option:<38}  ", " " * 42
+        lines += textwrap.wrap(text, 120, initial_indent=first, subsequent_indent=others, break_on_hyphens=False)
     return "\n".join(lines)
 
 
-def _key_help(table: typing.Any, field: dataclasses.Field[typing.Any], prefix: str) -> Iterator[str]:
-    """The lines of a key, or of a table of keys."""
-    name, kind, value = f"{prefix}{field.name}", field_types(type(table))[field.name], getattr(table, field.name)
-    if dataclasses.is_dataclass(value):
-        option, values = f"--{name}.KEY", list(vars(value).values())
-    else:
-        words = [SHORTCUTS[name]] if name in SHORTCUTS else []
-        metavar = _METAVARS.get(kind) or "|".join(typing.get_args(kind))
-        option, values = f"{', '.join([*words, f'--{name}'])} {metavar}", [value]
-    shown = " ".join(map(_shown, values))
-    text = f"{field.metadata['help']}{f' [{shown}]' if shown else ''}"
-    texts = textwrap.wrap(text, _WIDTH - _COLUMN, break_on_hyphens=False)
-    first = f"  {option}"
-    if len(first) + 2 > _COLUMN:
-        yield first
-        first = ""
-    for line in texts:
-        yield f"{first:<{_COLUMN}}{line}"
-        first = ""
+def _words(name: str) -> list[str]:
+    """What a key is called on the command line."""
+    return [*([SHORTCUTS[name]] if name in SHORTCUTS else []), f"--{name}"]
 
 
-def _shown(value: object) -> str:
-    """A value as on the command line."""
-    if isinstance(value, tuple):
-        return "x".join(map(str, value))
-    return str(value).lower() if isinstance(value, bool) else f"{value:g}" if isinstance(value, float) else str(value)
+def _metavar(kind: typing.Any) -> str:
+    parts = typing.get_args(kind)
+    if typing.get_origin(kind) is typing.Literal:
+        return "|".join(parts)
+    return " ".join(_METAVARS[part] for part in parts or (kind,))

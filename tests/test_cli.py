@@ -159,7 +159,7 @@ MISTAKES = {
     "no scene": (["tiny", "--data", "USED", "--out", "OUT"], "is no scene in a known format"),
     "run folder in use": (["tiny", "--data", "SCENE", "--out", "USED"], "is not empty"),
     "run folder inside a file": (["tiny", "--data", "SCENE", "--out", "USED/file/run"], "file"),
-    "no run": (["--eval", "nowhere"], "needs the folder of a finished run"),
+    "no run": (["--eval", "nowhere"], "need the folder of a run"),
     "no checkpoint": (["--eval", "USED"], "does not exist"),
 }
 

@@ -64,8 +64,7 @@ def test_learning_rates_that_do_not_follow_the_steps_are_named() -> None:
 def test_every_key_can_be_overridden_and_has_a_help_text() -> None:
     help_text = keys_help("dnerf")
     for key in config_keys():
-        section = key.rpartition(".")[0]
-        assert f"--{key} " in help_text or f"--{section}.KEY " in help_text, key
+        assert f"--{key} " in help_text, key
     keys = set(config_keys())
     assert {"seed", "data.path", "field.temporal.finest", "rates.means.start", "density.gradient"} <= keys
 
@@ -158,7 +157,7 @@ def test_presets_correct_times_after_density_control(preset: str) -> None:
     [
         ("steps = ", "cannot be read as TOML"),
         ('base = "dnerf"\n[schedule]\nstepz = 5', "no key schedule.stepz; did you mean schedule.steps?"),
-        ('base = "dnerf"\n[schedule]\nsteps = "5"', "schedule.steps must be a whole number, got '5'"),
+        ('base = "dnerf"\n[schedule]\nsteps = "x"', "schedule.steps must be a whole number, got 'x'"),
         ('base = "dnerf"\n[schedule]\nsteps = 0', "at least 1, got 0"),
         ('base = "dnerf"\nschedule = 5', "schedule must be a table, got 5"),
         ('base = "dnerf"\nseed = -1', "seed must lie between 0 and 2147483647, got -1"),

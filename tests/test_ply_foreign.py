@@ -97,13 +97,6 @@ def test_properties_that_are_not_used_are_named(tmp_path: Path, capsys: pytest.C
     assert "filter_3D" in capsys.readouterr().err
 
 
-def test_a_folder_of_stills(tmp_path: Path) -> None:
-    for name in ("frame_0.ply", "frame_1.ply"):
-        (tmp_path / name).write_bytes(b"")
-    with pytest.raises(InputError, match=r"2 \.ply files; give one of them, such as frame_0\.ply"):
-        read_ply(tmp_path)
-
-
 @pytest.mark.parametrize("kind", ["double", "text"])
 def test_doubles_far_from_the_origin(tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str) -> None:
     offset = np.array([448262.0, 5411932.0, 120.0])
@@ -204,13 +197,3 @@ def test_faces_before_the_vertices_are_refused_by_name(tmp_path: Path) -> None:
     (tmp_path / "a.ply").write_bytes(head.encode() + bytes(13))
     with pytest.raises(InputError, match="'face'"):
         read_points(tmp_path / "a.ply")
-
-
-def test_values_after_their_activation_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    columns = columns_of(random_still(N, 0))
-    assert read_ply(changed(tmp_path, {})) is not None
-    assert "activation" not in capsys.readouterr().err
-    columns |= {name: ("float", np.full(N, 0.5)) for name in ("opacity", "scale_0", "scale_1", "scale_2")}
-    (tmp_path / "b.ply").write_bytes(ply_bytes(columns))
-    read_ply(tmp_path / "b.ply")
-    assert "activation" in capsys.readouterr().err

@@ -90,7 +90,7 @@ def test_states_are_saved_at_intervals(
         original(out, state)
         saved.append(int(state["training.done"]))
 
-    monkeypatch.setattr("lapgs_wgpu.run.save_state", note)
+    monkeypatch.setattr("lapgs_wgpu.train.run_folder.save_state", note)
     interrupt_at(28, monkeypatch)
     out = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
@@ -143,7 +143,7 @@ def test_a_finished_run_is_not_resumed(
     assert cli.train_command(["--resume", str(trained_run), "--steps", "3"]) == 2
     assert "so --schedule.steps cannot be given" in capsys.readouterr().err
     assert cli.train_command(["--resume", str(trained_run.parent / "nowhere")]) == 2
-    assert "config.toml does not exist; --resume needs the folder of a run" in capsys.readouterr().err
+    assert "config.toml does not exist; --resume and --eval need the folder of a run" in capsys.readouterr().err
 
 
 def test_a_run_that_was_stopped_while_it_was_measured_goes_on(

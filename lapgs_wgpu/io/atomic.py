@@ -30,8 +30,6 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
-        if not path.parent.exists():
-            raise InputError(f"{path}: not written, since the folder {path.parent} does not exist; make it.") from error
         raise InputError(
             f"{path}: not written ({error.strerror or error}), and what was there before is unchanged; "
             "free some space or choose a folder that can be written to"
@@ -39,7 +37,12 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     finally:
         with suppress(OSError):  # it has the file's name by now, or the folder may be missing or read-only
             temporary.unlink()
-    _sync_folder(path)
+    with suppress(OSError):  # some file systems force no folder, and Windows opens none
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
 
 
 @contextmanager
@@ -61,13 +64,3 @@ def new_folder(folder: Path, advice: str = "make room there, or name another") -
         raise InputError(f"{folder} cannot be written ({error.strerror or error}); {advice}.") from None
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
-
-
-def _sync_folder(path: Path) -> None:
-    """Force the new name to the disk where the system can, so that it survives a power cut; else the old file may."""
-    with suppress(OSError):  # some file systems force no folder, and Windows opens none
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.io.atomic import atomic_write
-from lapgs_wgpu.io.ply import GaussianSnapshot, ply_header, read_gaussians, vertex_rows
+from lapgs_wgpu.io.ply import GaussianSnapshot, read_gaussians, write_ply
 from lapgs_wgpu.io.ply_elements import PathLike, PlyFile, open_ply
 from lapgs_wgpu.io.ply_foreign import read_foreign
 from lapgs_wgpu.io.safetensors_file import pack_tensors, unpack_tensors
@@ -41,7 +40,6 @@ def write_checkpoint(
     tensors: float, int or uint arrays of any shape. Raises InputError when the file cannot be written or a value is
     NaN or infinite.
     """
-    rows = vertex_rows(still, path)
     try:
         buffers = pack_tensors(tensors, metadata)
     except InputError as error:
@@ -49,10 +47,7 @@ def write_checkpoint(
     size = sum(map(len, buffers))
     words = -(-size // 4)
     trailer = f"element {_ELEMENT} {words}\ncomment {_ELEMENT} v{VERSION} safetensors {size}\nproperty uint word\n"
-    with atomic_write(path) as file:
-        file.write(ply_header(len(still), trailer))
-        for buffer in (rows.data, *buffers, b"\0" * (4 * words - size)):
-            file.write(buffer)
+    write_ply(path, still, trailer=trailer, buffers=[*buffers, b"\0" * (4 * words - size)])
 
 
 def read_checkpoint(path: PathLike) -> Checkpoint:

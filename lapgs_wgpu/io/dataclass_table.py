@@ -69,13 +69,11 @@ def build_dataclass(cls: type[T], table: Any, source: str, prefix: str = "", *, 
 
 
 def checked(kind: Any, value: Any, where: str, least: float = 0) -> Any:
-    """A TOML or JSON value as a value of this type. Raises InputError.
+    """A TOML or JSON value, or a text of the command line, as a value of this type. Raises InputError.
 
     Numbers must be from `least` to LARGEST_NUMBER, and texts printable.
     """
     origin, parts = typing.get_origin(kind), typing.get_args(kind)
-    if type(None) in parts:
-        return None if value is None else checked(parts[0], value, where, least)
     if origin is Literal:
         if value in parts:
             return value
@@ -87,30 +85,18 @@ def checked(kind: Any, value: Any, where: str, least: float = 0) -> Any:
             raise InputError(f"{where} must be {'a list' if many else f'{len(parts)} numbers'}, got {shown(value)}.")
         kinds = parts[:1] * len(value) if many else parts
         return tuple(checked(part, entry, where, least) for part, entry in zip(kinds, value, strict=True))
-    if origin is dict and isinstance(value, dict):
-        return {key: checked(parts[1], entry, f"{where}.{key}", least) for key, entry in value.items()}
-    if kind is Any:
-        return value
-    if type(value) is not kind and not (kind is float and type(value) is int):
+    if isinstance(value, str) and kind is bool:
+        value = {"true": True, "false": False}.get(value, value)
+    elif isinstance(value, str) and kind in (int, float):
+        with suppress(ValueError):
+            value = kind(value)
+    if type(value) is not (origin or kind) and not (kind is float and type(value) is int):
         raise InputError(f"{where} must be {_KIND_NAMES.get(kind, 'a table')}, got {shown(value)}.")
     if kind in (int, float) and not least <= value <= LARGEST_NUMBER:
         raise InputError(f"{where} must lie between {least:g} and {LARGEST_NUMBER}, got {shown(value)}.")
     if kind is str and not value.isprintable():
         raise InputError(f"{where} holds {shown(value)}, with characters that cannot be printed.")
     return float(value) if kind is float else value
-
-
-def from_text(text: str | list[str], kind: Any) -> Any:
-    """Text as a value of this type; a list as a tuple's entries. What is none stays as it is, for `checked`."""
-    if isinstance(text, list):
-        parts = typing.get_args(kind)
-        return [from_text(*each) for each in zip(text, parts, strict=True)] if len(text) == len(parts) else text
-    if kind is bool:
-        return {"true": True, "false": False}.get(text, text)
-    if kind in (int, float):
-        with suppress(ValueError):
-            return kind(text)
-    return text
 
 
 _KIND_NAMES = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}

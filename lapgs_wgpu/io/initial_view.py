@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -57,30 +58,28 @@ class InitialView(NamedTuple):
     @staticmethod
     def from_json(text: str) -> InitialView | None:
         """Parse the output of `to_json`. Returns None for any other text; the viewer then guesses a view."""
-        try:
+        with suppress(KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError):
             values: dict[str, Any] = json.loads(text)
             width, height = values["size"]
             K, T = np.array(values["K"], float), np.array(values["T_cam_world"], float)
             camera = Camera(K, T, int(width), int(height), float(values.get("near", 0.0)))
             focus, up = np.array(values["focus"], float), np.array(values["up"], float)
-            frames, arc = int(values["frames"]), values.get("arc")
-            usable = (
-                focus.shape == up.shape == (3,)
-                and bool(np.isfinite([focus, up]).all())
-                and bool(np.linalg.norm(up) > 1e-3)
-                and bool(camera.K[0, 0] > 0 and camera.K[1, 1] > 0)
-                and max(camera.width, camera.height) <= 1 << 16
-                and np.allclose(camera.T_cam_world[:3, :3] @ camera.T_cam_world[:3, :3].T, np.eye(3), atol=1e-3)
-            )
-            if arc is not None:
-                clockwise, counterclockwise = map(float, arc)
+            frames = max(1, min(int(values["frames"]), 1_000_000))
+            arc = None
+            if values.get("arc") is not None:
+                clockwise, counterclockwise = map(float, values["arc"])
                 arc = clockwise, counterclockwise
-                usable = usable and min(arc) >= 0 and sum(arc) <= 360
-        except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError):
-            return None
-        if not usable:
-            return None
-        return InitialView(camera, focus, up / np.linalg.norm(up), max(1, min(frames, 1_000_000)), arc)
+            if (
+                focus.shape == up.shape == (3,)
+                and np.isfinite([focus, up]).all()
+                and np.linalg.norm(up) > 1e-3
+                and min(K[0, 0], K[1, 1]) > 0
+                and max(camera.width, camera.height) <= 1 << 16
+                and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3)
+                and (arc is None or (min(arc) >= 0 and sum(arc) <= 360))
+            ):
+                return InitialView(camera, focus, up / np.linalg.norm(up), frames, arc)
+        return None
 
 
 def captured_arc(

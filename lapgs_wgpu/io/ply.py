@@ -6,6 +6,7 @@ found by name, since other programs use other orders and add properties.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,26 +54,32 @@ def _names(rest: int) -> list[str]:
 _WRITTEN_NAMES = [*_names(0)[:3], "nx", "ny", "nz", *_names(45)[3:]]
 
 
-def write_ply(path: PathLike, still: GaussianSnapshot, *, antialiased: bool = False) -> None:
+def write_ply(
+    path: PathLike,
+    still: GaussianSnapshot,
+    *,
+    antialiased: bool = False,
+    trailer: str = "",
+    buffers: Sequence[bytes | memoryview] = (),
+) -> None:
     """Write Gaussians with exactly the 62 properties of 3DGS, SH padded with zeros to degree 3. Atomic.
 
-    antialiased: adds the comment by which Brush and others tell how the Gaussians are drawn. Raises InputError when
-    the file cannot be written or a value could not be read back.
+    antialiased: adds the comment by which Brush and others tell how Gaussians are drawn. trailer: lines that declare
+    a further element, whose rows are the buffers. Raises InputError when the file cannot be written or a value could
+    not be read back.
     """
-    rows = vertex_rows(still, path)
-    with atomic_write(path) as file:
-        file.write(ply_header(len(still), f"comment {ANTIALIASED}\n" if antialiased else ""))
-        file.write(rows.data)
-
-
-def ply_header(count: int, trailer: str = "") -> bytes:
-    """The header for `count` Gaussians. trailer: lines of comments and further elements."""
+    rows = _vertex_rows(still, path)
     properties = "".join(f"property float {name}\n" for name in _WRITTEN_NAMES)
+    comment = f"comment {ANTIALIASED}\n" if antialiased else ""
     # Some viewers expect the count on the third line.
-    return f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}{trailer}end_header\n".encode()
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(still)}\n{properties}{comment}{trailer}"
+    with atomic_write(path) as file:
+        file.write(f"{header}end_header\n".encode())
+        for buffer in (rows.data, *buffers):
+            file.write(buffer)
 
 
-def vertex_rows(still: GaussianSnapshot, path: PathLike) -> Floats:
+def _vertex_rows(still: GaussianSnapshot, path: PathLike) -> Floats:
     """(N, 62) little-endian rows as in 3DGS. path: for errors. Raises InputError if they could not be read back."""
     if len(still) == 0:
         raise InputError(f"{path}: not written, because it would hold 0 Gaussians; at least 1 is needed")
@@ -111,17 +118,12 @@ def snapshot_of(values: Floats, names: list[str], path: PathLike) -> GaussianSna
     """The Gaussians of columns (N, len(names)) in the order of `gaussian_names`. Raises InputError as above."""
     _check_values(values, names, f"{path}:")
     rest = len(names) - len(_names(0))
-    end = 6 + rest  # of the colors
+    parts = np.split(values, np.cumsum([3, 3, rest, 1, 3]), axis=1)
+    means, dc, others, opacities, scales, quats = map(np.ascontiguousarray, parts)
     sh = np.empty((len(values), 1 + rest // 3, 3), np.float32)
-    sh[:, 0] = values[:, 3:6]
-    sh[:, 1:] = values[:, 6:end].reshape(len(values), 3, rest // 3).transpose(0, 2, 1)  # channel-major in the file
-    return GaussianSnapshot(
-        means=values[:, 0:3].copy(),
-        sh=sh,
-        opacity_logits=values[:, end].copy(),
-        log_scales=values[:, end + 1 : end + 4].copy(),
-        quats=values[:, end + 4 : end + 8].copy(),
-    )
+    sh[:, 0] = dc
+    sh[:, 1:] = others.reshape(len(values), 3, rest // 3).transpose(0, 2, 1)  # channel-major in the file
+    return GaussianSnapshot(means, sh, opacities[:, 0], scales, quats)
 
 
 def gaussian_names(vertex: Element, known: set[str], path: PathLike) -> list[str]:
@@ -144,36 +146,33 @@ def gaussian_names(vertex: Element, known: set[str], path: PathLike) -> list[str
     names = _names(rest)
     missing = [name for name in names if name not in known]
     if missing:
-        problem = "without which its Gaussians are not complete; export it with all properties of 3DGS"
-        if not any(name.startswith(("opacity", "scale_", "rot_")) for name in properties):
-            problem = "so it holds no Gaussians; a cloud of points is not shown, and a training may start at it"
         raise InputError(
-            f"{path}: its element vertex has {len(properties)} properties and lacks {len(missing)}, such as "
-            f"{', '.join(missing[:5])}, {problem}"
+            f"{path}: its element vertex has {len(properties)} properties and lacks {len(missing)} of 3DGS, such as "
+            f"{', '.join(missing[:5])}; export it with all (a cloud of points is not shown, a training may start at it)"
         )
     if vertex.count == 0:
         raise InputError(f"{path}: holds 0 Gaussians; at least 1 is needed")
     return names
 
 
-def _check_values(values: Floats, names: list[str], where: str) -> None:
-    """Raise InputError unless all values (N, len(names)) are finite, also after their activations."""
+def problems(values: Floats, names: list[str]) -> Iterator[tuple[NDArray[np.bool_], str]]:
+    """Rows (N,) of values (N, len(names)) that cannot be rendered, and why: those not finite once activated."""
+    finite = np.isfinite(values)
+    for column in np.flatnonzero(~finite.all(axis=0)):
+        yield ~finite[:, column], f"property {names[column]} is NaN or infinite"
+    for name, column in zip(names[-7:-4], values.T[-7:-4], strict=True):
+        yield column > MAX_LOG_SCALE, f"property {name} (log scale) is over {MAX_LOG_SCALE:g}"
+    with np.errstate(over="ignore", under="ignore"):
+        squared_length = np.square(values[:, -4:]).sum(axis=1)
+    unusable = ~np.isfinite(squared_length) | (squared_length == 0)
+    yield unusable, "the quaternion rot_0..3 has a length that cannot be normalised in float32"
 
-    def refuse(bad: NDArray[np.bool_], what: str) -> None:
+
+def _check_values(values: Floats, names: list[str], where: str) -> None:
+    """Raises InputError where rows cannot be rendered."""
+    for bad, what in problems(values, names):
         if bad.any():
             raise InputError(
                 f"{where} {what} in {np.count_nonzero(bad)} of {len(bad)} rows, first in row {np.flatnonzero(bad)[0]} "
                 "(counted from 0); the file is damaged or its training diverged"
             )
-
-    finite = np.isfinite(values)
-    for column in np.flatnonzero(~finite.all(axis=0)):
-        refuse(~finite[:, column], f"property {names[column]} is NaN or infinite")
-    for name, column in zip(names[-7:-4], values.T[-7:-4], strict=True):
-        refuse(column > MAX_LOG_SCALE, f"property {name} (log scale) is over {MAX_LOG_SCALE:g}")
-    with np.errstate(over="ignore", under="ignore"):
-        squared_length = np.square(values[:, -4:]).sum(axis=1)
-    refuse(
-        ~np.isfinite(squared_length) | (squared_length == 0),
-        "the quaternion rot_0..3 has a length that cannot be normalised in float32",
-    )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
+from numpy.lib.recfunctions import structured_to_unstructured
 from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError
@@ -24,6 +26,11 @@ Floats = NDArray[np.float32]
 
 BAD_SHARE = 0.01  # of all rows: up to it rows with NaN are left out, above it a file is damaged
 LFS_POINTER = b"version https://git-lfs"  # begins what a clone without Git LFS holds in place of a file
+_OTHERS = {  # what is given in place of a PLY file, by its first bytes in small letters
+    LFS_POINTER: "is a pointer of Git LFS in place of the file; fetch it by git lfs pull",
+    b"\x1f\x8b": "is packed by gzip; unpack it",
+    b"<!doctype html": "is a web page, and this is not a browser; give the checkpoint that it was made of",
+}
 SPLATS = (".spz", ".sog", ".splat", ".ksplat", ".lcc")  # formats of stills that others convert to .ply
 MAX_HEADER_BYTES = 64 * 1024
 SH_C0 = 0.28209479177387814  # the harmonic of degree 0: f_dc * SH_C0 + 0.5 is a color
@@ -31,7 +38,6 @@ _PREFIXES = ("", "diffuse_", "vertex_", "scalar_", "ambient_", "color_", "cd_")
 _TRIPLES = [
     [f"{before}{name}" for name in names] for before in _PREFIXES for names in (("red", "green", "blue"), "rgb")
 ]
-_BLOCK_BYTES = 1 << 20  # rows are converted in blocks that stay in the cache
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 _SCALARS = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
@@ -47,16 +53,15 @@ class Element:
     offset: byte of the file at which it begins; line after the header in a text file.
     """
 
-    name: str
     count: int
     properties: dict[str, np.dtype[Any]] = field(default_factory=dict)
     has_lists: bool = False
     offset: int = 0
 
     @property
-    def stride(self) -> int:
-        """Bytes of a row."""
-        return sum(dtype.itemsize for dtype in self.properties.values())
+    def row(self) -> np.dtype[Any]:
+        """The type of a row without lists."""
+        return np.dtype(list(self.properties.items()))
 
 
 class PlyFile(NamedTuple):
@@ -72,81 +77,48 @@ class PlyFile(NamedTuple):
 
     def columns(self, element: Element, names: list[str], dtype: type = np.float32) -> NDArray[Any]:
         """(N, len(names)): the named properties of all rows of an element. Raises InputError."""
-        values: NDArray[Any] = np.empty((element.count, len(names)), dtype)
-        read = self._text_rows if self.encoding == "ascii" else self._binary_rows
+        if element.count == 0:
+            return np.empty((0, len(names)), dtype)
         with np.errstate(all="ignore"):  # a double beyond float32 becomes infinite, which callers report
-            for start, rows in read(element, names):
-                for column, name in enumerate(names):
-                    values[start : start + len(rows), column] = rows[name]
-        return values
+            rows = self._rows(element)
+            if len(rows) < element.count:
+                raise InputError(f"{self.path}: has {len(rows)} of the {element.count} rows declared; it is cut off.")
+            values: NDArray[Any] = structured_to_unstructured(rows[names], dtype, copy=True)
+            return values
 
-    def _binary_rows(self, element: Element, names: list[str]) -> Iterator[tuple[int, NDArray[Any]]]:
-        layout = np.dtype(list(element.properties.items()))[names]
-        size = max(1, _BLOCK_BYTES // element.stride)
-        self.file.seek(element.offset)
-        for start in range(0, element.count, size):
-            rows = np.fromfile(self.file, layout, min(size, element.count - start))
-            if start + len(rows) < min(start + size, element.count):
-                raise InputError(
-                    f"{self.path}: shrank while it was read, to {start + len(rows)} of {element.count} rows."
-                )
-            yield start, rows
-
-    def _text_rows(self, element: Element, names: list[str]) -> Iterator[tuple[int, NDArray[Any]]]:
+    def _rows(self, element: Element) -> NDArray[Any]:
+        if self.encoding != "ascii":
+            self.file.seek(element.offset)
+            return np.fromfile(self.file, element.row, element.count)
         self.file.seek(self.header_bytes)
-        lines = self.file.read().decode(errors="replace").splitlines()[element.offset :][: element.count]
-        if len(lines) < element.count:
-            raise InputError(
-                f"{self.path}: declares {element.count} rows of {element.name}, and {len(lines)} follow; it is cut off."
-            )
-        layout = np.dtype([(name, np.float64) for name in element.properties])
-        table = np.empty(element.count, layout)
-        for number, line in enumerate(lines):
-            try:
-                table[number] = tuple(map(float, line.split()))
-            except ValueError:
-                what = f"{self.path}: row {number} of {element.name}, {line[:80]!r},"
-                raise InputError(f"{what} does not hold {len(element.properties)} numbers; it is damaged.") from None
-        yield 0, table
+        row = np.dtype([(name, np.float64) for name in element.properties])
+        options: dict[str, Any] = {"comments": None, "ndmin": 1, "encoding": "latin1"}
+        try:
+            with warnings.catch_warnings(action="ignore"):  # of lines without numbers
+                return np.loadtxt(self.file, row, skiprows=element.offset, max_rows=element.count, **options)
+        except ValueError as error:
+            raise InputError(f"{self.path}: its lines do not hold the declared numbers ({error}).") from None
 
 
 @contextmanager
 def open_ply(path: PathLike) -> Iterator[PlyFile]:
     """Open a file and read its header. The sizes of the elements add up to the file size. Raises InputError."""
-    if os.path.isdir(path):
-        raise InputError(f"{path}: is a folder{_advice(Path(path))}.")
     with open_regular(path) as file:
         yield _read_header(file, path)
 
 
-def _advice(folder: Path) -> str:
-    """What to give in place of a folder."""
-    names = sorted(file.name for file in folder.glob("*.ply"))
-    if not names:
-        return " without a .ply file; give the .ply file itself"
-    if "checkpoint.ply" in names or len(names) == 1:
-        return f"; give the file {'checkpoint.ply' if 'checkpoint.ply' in names else names[0]} in it"
-    return f" of {len(names)} .ply files; give one of them, such as {names[0]}, or look at all by lapgs-view"
-
-
 def _read_header(file: BinaryIO, path: PathLike) -> PlyFile:
     head = file.read(MAX_HEADER_BYTES)
-    if head[:64].lstrip().lower().startswith(b"<!doctype html"):
-        raise InputError(f"{path}: is a web page, and this is not a browser; give the checkpoint that it was made of.")
     if re.match(rb"ply\r?\n", head) is None:
-        if not head:
-            raise InputError(f"{path}: is empty (0 bytes); copy or write it again.")
-        if head.startswith(LFS_POINTER):
-            raise InputError(f"{path}: is a pointer of Git LFS in place of the file; fetch it by git lfs pull.")
         ending = Path(path).suffix.lower()
         if ending in SPLATS:
             raise InputError(f"{path}: is a {ending} file, which is not read; splat-transform converts it.")
-        if head.startswith(b"\x1f\x8b"):
-            raise InputError(f"{path}: is packed by gzip; unpack it.")
-        raise InputError(
-            f"{path}: begins with {head[:8]!r}, where a PLY file begins with the line 'ply'; convert it to .ply, a "
-            "cloud of points with CloudCompare for example."
+        otherwise = (
+            f"begins with {head[:8]!r} ({len(head)} bytes were read), where a PLY file begins with the line 'ply'; "
+            "convert it to .ply, a cloud of points with CloudCompare for example"
         )
+        told = (text for begin, text in _OTHERS.items() if head[:32].lower().startswith(begin))
+        raise InputError(f"{path}: {next(told, otherwise)}.")
     end = re.search(rb"^end_header\r?\n", head, re.MULTILINE)
     if end is None:
         raise InputError(
@@ -166,32 +138,22 @@ def _parse_lines(lines: list[str], path: PathLike) -> tuple[str, dict[str, Eleme
     last: Element | None = None
     encoding = ""
     for number, line in enumerate(lines, start=2):
-        where = f"{path}: header line {number}, {line[:80]!r},"
         match line.split():
             case ["comment" | "obj_info", *_]:
                 pass
-            case ["format", encoding, _]:
-                if encoding not in _BYTE_ORDERS:
-                    raise InputError(f"{where} has none of the encodings {', '.join(_BYTE_ORDERS)}.")
-            case ["element", name, count]:
-                if name in elements:
-                    raise InputError(f"{where} declares an element a second time; the file is damaged.")
-                if not re.fullmatch("[0-9]{1,18}", count):
-                    raise InputError(f"{where} does not declare a count from 0 to 10^18 - 1; the file is damaged.")
-                last = elements[name] = Element(name, int(count))
+            case ["format", encoding, _] if encoding in _BYTE_ORDERS:
+                pass
+            case ["element", name, count] if name not in elements and re.fullmatch("[0-9]{1,18}", count):
+                last = elements[name] = Element(int(count))
             case ["property", "list", length, kind, _] if last is not None and {length, kind} <= _SCALARS.keys():
                 last.has_lists = True
-            case ["property", kind, name]:
-                if last is None or kind not in _SCALARS:
-                    what = (
-                        "stands before any element" if last is None else f"has the type {kind[:40]!r}, unknown in PLY"
-                    )
-                    raise InputError(f"{where} {what}; write the file again with another program.")
-                if name in last.properties:
-                    raise InputError(f"{where} declares a property a second time; the file is damaged.")
+            case ["property", kind, name] if last is not None and kind in _SCALARS and name not in last.properties:
                 last.properties[name] = np.dtype(_BYTE_ORDERS.get(encoding, "<") + _SCALARS[kind])
             case _:
-                raise InputError(f"{where} is not a line of a PLY header; the file is damaged.")
+                raise InputError(
+                    f"{path}: header line {number}, {line[:80]!r}, stands in no PLY header at this place, has an "
+                    "unknown encoding, type or count, or repeats a name; write the file again with another program."
+                )
     if not encoding:
         raise InputError(f"{path}: its header has no line 'format binary_little_endian 1.0'; the file is damaged.")
     return encoding, elements
@@ -200,32 +162,27 @@ def _parse_lines(lines: list[str], path: PathLike) -> tuple[str, dict[str, Eleme
 def _place(
     elements: dict[str, Element], encoding: str, start: int, file: BinaryIO, path: PathLike
 ) -> dict[str, Element]:
-    """Set the offsets of the elements and return those without lists. They must fill the file.
-
-    Of a binary file, those behind an element with lists are passed over, too: where they begin is not known.
-    """
+    """Set the offsets of elements before the first with lists, and return them. Without lists, they fill the file."""
     text, size = encoding == "ascii", os.fstat(file.fileno()).st_size
     end, line = start, 0
     placed: dict[str, Element] = {}
-    for element in elements.values():
-        before = not text and "vertex" in elements and "vertex" not in placed
-        if element.has_lists and (element.name == "vertex" or before):
+    for name, element in elements.items():
+        if element.has_lists and "vertex" in elements.keys() - placed.keys():
             raise InputError(
-                f"{path}: element {element.name[:40]!r} has lists, which are read neither in vertex nor before it; "
+                f"{path}: element {name[:40]!r} has lists, which are read neither in vertex nor before it; "
                 "write the file again with another program."
             )
-        if element.has_lists and not text:
+        if element.has_lists:
             return placed
-        if not element.has_lists:
-            placed[element.name] = element
+        placed[name] = element
         element.offset = line if text else end
         # In text, a value takes a character and the blank or the line's end behind it.
-        stride = max(2 * len(element.properties), 1) if text else element.stride
+        stride = max(2 * len(element.properties), 1) if text else element.row.itemsize
         end += element.count * stride
         line += element.count
         if end > size + text:  # the last line needs no end
             raise InputError(
-                f"{path}: element {element.name[:40]!r} ({element.count} rows of {stride} bytes) would end at byte "
+                f"{path}: element {name[:40]!r} ({element.count} rows of {stride} bytes) would end at byte "
                 f"{end}, but the file has {size} bytes: it is truncated or its header is wrong."
             )
     file.seek(end)

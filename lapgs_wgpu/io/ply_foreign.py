@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.io.ply import MAX_LOG_SCALE, GaussianSnapshot, gaussian_names, snapshot_of, vertex_of
-from lapgs_wgpu.io.ply_elements import BAD_SHARE, SH_C0, Element, Floats, PathLike, PlyFile, read_colors
+from lapgs_wgpu.io.ply import GaussianSnapshot, gaussian_names, problems, snapshot_of, vertex_of
+from lapgs_wgpu.io.ply_elements import BAD_SHARE, SH_C0, Floats, PathLike, PlyFile, read_colors
 
 _MOTION = re.compile(  # words of a property's name that speak of time or of motion
     "(.*_)?(trbf|motion|omega|velocity|vel|v[xyz]|rot_r|t|time|timestamp|duration|lifetime|poly|fourier|traj|deform|temporal)"
@@ -31,9 +31,9 @@ def read_foreign(ply: PlyFile) -> tuple[GaussianSnapshot, dict[str, str]]:
     vertical axis; `offset` is a JSON list of 3 numbers, which were taken off the means.
 
     Degree 0 may be given as colors; the third scale of flat Gaussians, or two scales and the quaternion of spherical
-    ones, may be missing; a note names the properties that are not used. An infinite opacity is opaque, or
-    leaves the Gaussian out; a scale of 0 is flat; a quaternion of 0 does not turn. A few rows that cannot be rendered
-    are left out. Raises InputError for all else that `snapshot_of` refuses, and for Gaussians that move.
+    ones, may be missing. An infinite opacity is opaque, or leaves the Gaussian out; a scale of 0 is flat; a quaternion
+    of 0 does not turn. A few rows that cannot be rendered are left out. Raises InputError for all else that
+    `snapshot_of` refuses, and for Gaussians that move.
     """
     vertex = vertex_of(ply)
     moving = [name for name in vertex.properties if _MOTION.fullmatch(name)]
@@ -68,56 +68,42 @@ def read_foreign(ply: PlyFile) -> tuple[GaussianSnapshot, dict[str, str]]:
     axis = re.search(r"(?:vertical|up)[ _]?axis\s*[:=]\s*\+?(-?[xyz])\b", text, re.IGNORECASE)
     if axis:
         metadata["up"] = axis[1].lower()
-    offset = _take_off_offset(ply, vertex, values)
-    if offset is not None:
-        metadata["offset"] = json.dumps(offset)
-        _note(ply.path, f"lies far from the origin: {offset} is taken off all coordinates")
-    return snapshot_of(_mended(values, ply.path), names, ply.path), metadata
+    means = ply.columns(vertex, ["x", "y", "z"], np.float64)
+    offset = _offset(means)
+    if offset.any():
+        with np.errstate(over="ignore"):
+            values[:, :3] = means - offset
+        metadata["offset"] = json.dumps(offset.tolist())
+        _note(ply.path, f"lies far from the origin: {offset.tolist()} is taken off all coordinates")
+    return snapshot_of(_mended(values, names, ply.path), names, ply.path), metadata
 
 
 def _note(path: PathLike, text: str) -> None:
     print(f"note: {path}: {text}.", file=sys.stderr)
 
 
-def _take_off_offset(ply: PlyFile, vertex: Element, values: Floats) -> list[float] | None:
-    """Move the means in `values` to the origin where float32 would hold few digits of them; return what is taken off.
-
-    Such places are read again in float64: in float32 they are terraces.
-    """
-    middle, extent = _middle_and_extent(values[:, :3].astype(np.float64))
-    if np.abs(middle).max() <= _FAR * extent:
-        return None
-    exact = ply.columns(vertex, ["x", "y", "z"], np.float64)
-    middle, extent = _middle_and_extent(exact)
-    if extent == 0:
-        return None
-    offset = np.round(middle, max(0, -int(np.floor(np.log10(extent)))))
-    with np.errstate(all="ignore"):
-        values[:, :3] = exact - offset
-    return [float(value) for value in offset]
-
-
-def _middle_and_extent(means: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Median (3,) of means (N, 3), and the longest side of the box around nine tenths of them; 0 of no finite ones."""
+def _offset(means: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What is taken off means (N, 3) where float32, in which they are terraces, would hold few digits of them: (3,)."""
     finite = means[np.isfinite(means).all(axis=1)]
     if not len(finite):
-        return np.zeros(3), 0.0
+        return np.zeros(3)
     low, middle, high = np.quantile(finite, [0.05, 0.5, 0.95], axis=0)
-    return middle, float((high - low).max())
+    extent = (high - low).max()  # of nine tenths
+    if extent == 0 or np.abs(middle).max() <= _FAR * extent:
+        return np.zeros(3)
+    return np.round(middle, max(0, -int(np.floor(np.log10(extent)))))
 
 
-def _mended(values: Floats, path: PathLike) -> Floats:
+def _mended(values: Floats, names: list[str], path: PathLike) -> Floats:
     """Replace in columns what is legal and cannot be rendered as it is, and leave out rows."""
     opacities, scales, quats = values[:, -8], values[:, -7:-4], values[:, -4:]
     invisible = opacities == -np.inf
     opacities[opacities == np.inf] = _OPAQUE
     scales[scales == -np.inf] = _FLAT
-    largest = np.abs(quats).max(axis=1)
-    unusual = ~((largest > 1e-12) & (largest < 1e12)) & np.isfinite(largest)
-    quats[unusual & (largest > 0)] /= largest[unusual & (largest > 0), None]
-    quats[unusual & (largest == 0)] = [1, 0, 0, 0]
-    bad = ~np.isfinite(values).all(axis=1) & ~invisible
-    bad |= (scales > MAX_LOG_SCALE).any(axis=1) & ~invisible
+    quats[(quats == 0).all(axis=1)] = [1, 0, 0, 0]
+    bad = np.zeros(len(values), bool)
+    for rows, _ in problems(values, names):
+        bad |= rows & ~invisible
     if bad.mean() > BAD_SHARE:
         return values  # refused as a whole
     if bad.any():
@@ -125,12 +111,4 @@ def _mended(values: Floats, path: PathLike) -> Floats:
     if invisible.all():
         raise InputError(f"{path}: no Gaussian is visible (property opacity is minus infinity in all {len(bad)} rows)")
     kept = ~(bad | invisible)
-    shown = values if kept.all() else values[kept]
-    if ((shown[:, -8] >= 0) & (shown[:, -8] <= 1)).all() and len(shown) > 1:
-        both = " and all scales above 0" * bool((shown[:, -7:-4] > 0).all())
-        _note(
-            path,
-            f"all opacities lie in 0 to 1{both}, as after their activation; 3DGS files hold logits and logarithms, and "
-            "these are shown as such",
-        )
-    return shown
+    return values if kept.all() else values[kept]

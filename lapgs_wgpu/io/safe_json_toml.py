@@ -24,7 +24,7 @@ _LONG_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]+|"(?:[^"\\\n]|\\.)*"|'[^'\n]*')
 
 def read_json(path: PathLike) -> Any:
     """Read a JSON file. Of duplicate names in an object, the last one counts. Raises InputError."""
-    return parse_json(_read_text(path, MAX_JSON_BYTES, "JSON"), str(path))
+    return _parsed(json.loads, _read(path, MAX_JSON_BYTES), str(path), "JSON")
 
 
 def parse_json(text: str, where: str) -> Any:
@@ -34,45 +34,38 @@ def parse_json(text: str, where: str) -> Any:
 
 def read_toml(path: PathLike) -> dict[str, Any]:
     """Read a TOML file. Raises InputError."""
-    text = _read_text(path, MAX_TOML_BYTES, "TOML")
+    return _parsed(_toml, _read(path, MAX_TOML_BYTES), str(path), "TOML")
+
+
+def _toml(data: bytes) -> dict[str, Any]:
+    text = data.decode()
     if _LONG_KEY.search(text):
-        raise InputError(f"{path}: cannot be read as TOML: it holds a dotted key of more than 16 parts.")
-    return _parsed(tomllib.loads, text, str(path), "TOML")
+        raise ValueError("it holds a dotted key of more than 16 parts")
+    return tomllib.loads(text)
 
 
-def _parsed(parse: Callable[[str], Any], text: str, where: str, language: str) -> Any:
-    try:
-        value = parse(text)
-    except ValueError as error:
-        raise InputError(f"{where}: cannot be read as {language}: {str(error)[:200]}.") from None
-    except RecursionError:
-        raise InputError(f"{where}: cannot be read as {language}: it is nested too deeply.") from None
-    _check_depth(value, where, language)
-    return value
-
-
-def _read_text(path: PathLike, most: int, language: str) -> str:
+def _read(path: PathLike, most: int) -> bytes:
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
         if size > most:
-            raise InputError(f"{path}: cannot be read as {language}: it has {size} bytes, over {most}.")
-        data = file.read(size)
+            raise InputError(f"{path}: cannot be read: it has {size} bytes, over {most}.")
+        return file.read(size)
+
+
+def _parsed(parse: Callable[[Any], Any], content: str | bytes, where: str, language: str) -> Any:
     try:
-        return data.decode("utf-8-sig" if language == "JSON" else "utf-8")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: cannot be read as {language}: byte {error.start} is not UTF-8.") from None
+        value = parse(content)
+        if _nested_within(value, MAX_DEPTH):
+            return value
+        reason = f"it is nested more than {MAX_DEPTH} deep"
+    except (ValueError, RecursionError) as error:
+        reason = "it is nested too deeply" if isinstance(error, RecursionError) else str(error)[:200]
+    raise InputError(f"{where}: cannot be read as {language}: {reason}.")
 
 
-def _check_depth(value: Any, where: str, language: str) -> None:
-    """Reject deep nesting: later code recurses. Raises InputError."""
-    level = [value] if isinstance(value, list | dict) else []
-    for _ in range(MAX_DEPTH):
-        level = [
-            inner
-            for outer in level
-            for inner in (outer.values() if isinstance(outer, dict) else outer)
-            if isinstance(inner, list | dict)
-        ]
-        if not level:
-            return
-    raise InputError(f"{where}: cannot be read as {language}: it is nested more than {MAX_DEPTH} deep.")
+def _nested_within(value: Any, depth: int) -> bool:
+    """Whether lists and tables lie at most `depth` deep in each other: later code recurses."""
+    if not isinstance(value, list | dict):
+        return True
+    inner = value.values() if isinstance(value, dict) else value
+    return depth > 0 and all(_nested_within(each, depth - 1) for each in inner)

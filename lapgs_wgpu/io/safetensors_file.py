@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.errors import InputError, shown
 
 Array = NDArray[Any]
 
@@ -58,16 +58,20 @@ def unpack_tensors(file: BinaryIO, size: int, where: str) -> tuple[dict[str, Arr
     Allocates `size` bytes, and at most some tens of MB for the header. Raises InputError, whose message begins with
     `where`, if sizes contradict each other or a float is not finite.
     """
-    if size < 8:
-        raise InputError(f"{where}: has {size} bytes, where the shortest safetensors file has 10; the file is damaged")
     length = int.from_bytes(file.read(8), "little")
-    limit = min(size - 8, MAX_HEADER_BYTES)
-    if length > limit:
-        raise InputError(f"{where}: declares a header of {length} bytes, of at most {limit}; the file is damaged")
-    header = _parse_json(file.read(length), where)
-    metadata = header.pop(_METADATA, {})
+    if length > min(size - 8, MAX_HEADER_BYTES):
+        raise InputError(
+            f"{where}: declares a header of {length} bytes in {size} bytes, of at most {MAX_HEADER_BYTES}; the file is "
+            "damaged"
+        )
+    try:
+        header = json.loads(file.read(length).decode(), object_pairs_hook=_unique)
+        json.dumps(header, ensure_ascii=False).encode()  # half a surrogate pair could not be printed later
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{where}: its header is not valid JSON ({str(error)[:120]}); the file is damaged") from error
+    metadata = header.pop(_METADATA, {}) if isinstance(header, dict) else None
     if not isinstance(metadata, dict) or not all(isinstance(text, str) for text in metadata.values()):
-        raise InputError(f"{where}: its {_METADATA} is not a table of texts; the file is damaged")
+        raise InputError(f"{where}: its header is not a table, or {_METADATA} none of texts; the file is damaged")
     rest = size - 8 - length
     entries = sorted((_parse_entry(name, entry, where), name) for name, entry in header.items())
     position = 0
@@ -84,45 +88,27 @@ def unpack_tensors(file: BinaryIO, size: int, where: str) -> tuple[dict[str, Arr
     }, metadata
 
 
-def _parse_json(data: bytes, where: str) -> dict[str, Any]:
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        table = dict(pairs)
-        if len(table) != len(pairs):
-            raise ValueError("a name stands twice")
-        return table
-
-    try:
-        header = json.loads(data.decode(), object_pairs_hook=unique)
-        json.dumps(header, ensure_ascii=False).encode()  # half a surrogate pair could not be printed later
-    except (ValueError, RecursionError) as error:
-        reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)[:120]
-        raise InputError(f"{where}: its header is not valid JSON ({reason}); the file is damaged") from error
-    if not isinstance(header, dict):
-        raise InputError(f"{where}: its header is not a JSON table; the file is damaged")
-    return header
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    if len(table := dict(pairs)) != len(pairs):
+        raise ValueError("a name stands twice")
+    return table
 
 
 def _parse_entry(name: str, entry: Any, where: str) -> tuple[tuple[int, int], tuple[int, ...], str]:
     """The bytes (begin, end) after the header, the shape and the dtype that a tensor's entry declares."""
-
-    def sizes(value: Any, most: int) -> bool:
-        return isinstance(value, list) and len(value) <= most and all(type(i) is int and 0 <= i < 2**53 for i in value)
-
-    where = f"{where}: tensor {name[:80]!r}"
-    if not isinstance(entry, dict) or entry.keys() != {"dtype", "shape", "data_offsets"}:
-        raise InputError(f"{where} is not declared by dtype, shape and data_offsets; the file is damaged")
-    code, shape, offsets = entry["dtype"], entry["shape"], entry["data_offsets"]
-    if not isinstance(code, str) or code not in _DTYPES:
-        raise InputError(f"{where} has the unknown dtype {str(code)[:40]!r}; known are {', '.join(_DTYPES)}")
-    if not sizes(shape, 8) or not sizes(offsets, 2) or len(offsets) != 2:
-        raise InputError(f"{where} has a shape of {str(shape)[:80]} at bytes {str(offsets)[:80]}; the file is damaged")
-    needed = math.prod(shape) * np.dtype(_DTYPES[code]).itemsize
-    if needed != offsets[1] - offsets[0] or math.prod(max(i, 1) for i in shape) >= 2**53:
-        raise InputError(
-            f"{where} of shape {shape} and dtype {code} needs {needed} bytes, but its data_offsets {offsets} "
-            f"hold {offsets[1] - offsets[0]}; the file is damaged"
-        )
-    return (offsets[0], offsets[1]), tuple(shape), code
+    match entry:
+        case {"dtype": str(code), "shape": [*shape], "data_offsets": [int(begin), int(end)]} if (
+            code in _DTYPES
+            and len(shape) <= 8
+            and all(type(size) is int and size >= 0 for size in shape)
+            and math.prod(max(size, 1) for size in shape) < 2**53
+            and math.prod(shape) * np.dtype(_DTYPES[code]).itemsize == end - begin
+        ):
+            return (begin, end), tuple(shape), code
+    raise InputError(
+        f"{where}: tensor {name[:80]!r} is declared as {shown(entry)}, which is no shape of a known dtype with the "
+        "data_offsets of as many bytes; the file is damaged"
+    )
 
 
 def _read_array(file: BinaryIO, shape: tuple[int, ...], code: str, where: str) -> Array:
@@ -130,8 +116,6 @@ def _read_array(file: BinaryIO, shape: tuple[int, ...], code: str, where: str) -
     if file.readinto(array.reshape(-1).view(np.uint8)) != array.nbytes:  # type: ignore[attr-defined]  # all have it
         raise InputError(f"{where}: became shorter while it was read")
     _check_finite(array, where)
-    if array.dtype == np.bool_ and (array.view(np.uint8) > 1).any():
-        raise InputError(f"{where}: has truth values other than 0 and 1; the file is damaged")
     return array
 
 

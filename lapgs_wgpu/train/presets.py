@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from lapgs_wgpu.errors import InputError, shown
-from lapgs_wgpu.io.dataclass_table import build_dataclass, checked, did_you_mean, field_types, from_text
+from lapgs_wgpu.io.dataclass_table import build_dataclass, checked, did_you_mean, field_types
 from lapgs_wgpu.io.safe_json_toml import read_toml
 from lapgs_wgpu.motion.fields.config import Method
 from lapgs_wgpu.train.config import Config, Rate
@@ -73,11 +73,9 @@ def load_config(
     for key, value in {**_shorthands(method, ablate), **(overrides or {})}.items():
         if key not in known:
             raise InputError(f"there is no key {key!r}{did_you_mean(key, known)}")
-        texts = isinstance(value, str) or (isinstance(value, list) and all(isinstance(each, str) for each in value))
-        parsed = from_text(value, known[key]) if texts else value
         for part in reversed(key.split(".")):
-            parsed = {part: parsed}
-        base = _merge(base, parsed)
+            value = {part: value}
+        base = _merge(base, value)
     return build_dataclass(Config, base, preset, advice=ADVICE)
 
 
