@@ -9,7 +9,7 @@ W_temporal^T; features = gate(layers + biases); outputs = features W_heads^T.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 from lapgs_wgpu.gpu.array import DeviceArray
@@ -83,10 +83,6 @@ class FieldWeights:
         """Number of channels of all layers: spatial, the motion's inner ones, temporal."""
         return self.placed + self.width
 
-    def matrix(self, array: DeviceArray, name: str, rows: int, columns: int) -> Matrix:
-        """A matrix that begins with a parameter, in the array of weights or of their gradients."""
-        return Matrix(array, rows, columns, columns, self.places[name].first)
-
     def heads(self, name: str) -> Heads:
         """Arrays for heads, or for their gradients, by name."""
         first = -(-self.outputs * self.placed // ALIGNED) * ALIGNED
@@ -130,35 +126,42 @@ class FieldWeights:
 
 
 class _Product(NamedTuple):
-    """What an input adds to the layers: the first `columns` columns of it, times as many of a parameter from `column`
-    on, give `channels` channels from `channel` on."""
+    """An addend of the layers: the first `columns` columns of an input, times a matrix (channels, columns) of the
+    weights, give `channels` channels from `channel` on. first, stride: of that matrix."""
 
-    name: str
     input: str
-    parameter: str
-    column: int
     columns: int
     channel: int
     channels: int
+    first: int
+    stride: int
+
+    def weights(self, array: DeviceArray) -> Matrix:
+        """The matrix in the array of weights, or its place in that of their gradients."""
+        return Matrix(array, self.channels, self.columns, self.stride, self.first)
+
+    def given(self, inputs: Mapping[str, DeviceArray], first: int, count: int) -> Matrix:
+        """The input's columns in some rows."""
+        return Matrix.of(inputs[self.input].rows(first, count)).from_column(0, self.columns)
 
 
 class DecoderPasses:
-    """Records the passes on one device.
+    """Records the passes on one device, a block of Gaussians after another.
 
     inputs, in the calls: by name, beside (N, D + 1) dynamics attributes, then ones; static and temporal (N, features),
-    the latter where there is any. weights: the array of `FieldWeights`. block: number of Gaussians per block, a
-    multiple of 64.
+    the latter where there is any. weights: the array of `FieldWeights`.
     """
 
-    def __init__(self, device: Device, layers: FieldWeights, *, block: int | None = None) -> None:
-        self.device, self._of, self.pool = device, layers, BufferPool(device)
-        self._product = Matmul(device, self.pool)
-        self._size = block or max(64, min(_BLOCK, device.max_binding // (4 * layers.channels) // 64 * 64))
-        placed, width = layers.placed, layers.width
+    def __init__(self, device: Device, layers: FieldWeights) -> None:
+        self._device, self._of, self._pool = device, layers, BufferPool(device)
+        self._product = Matmul(device, self._pool)
+        self._block = max(64, min(_BLOCK, device.max_binding // (4 * layers.channels) // 64 * 64))
+        placed, width, dynamics = layers.placed, layers.width, layers.dynamics
+        (spatial, _), (temporal, (_, row)) = (layers.places[f"{name}.weight"] for name in ("spatial", "temporal"))
         products = [
-            _Product("static", "static", "spatial.weight", 0, layers.static, 0, placed),
-            _Product("dynamics", "beside", "temporal.weight", 0, layers.dynamics, placed, width),
-            _Product("temporal", "temporal", "temporal.weight", layers.dynamics, layers.temporal, placed, width),
+            _Product("static", layers.static, 0, placed, spatial, layers.static),
+            _Product("beside", dynamics, placed, width, temporal, row),
+            _Product("temporal", layers.temporal, placed, width, temporal + dynamics, row),
         ]
         self._products = [each for each in products if each.columns]
 
@@ -189,55 +192,46 @@ class DecoderPasses:
     ) -> None:
         """Record the backward pass: d_inputs, which may be the inputs' own arrays, and d_heads are written, d_weights
         added to."""
-        split, ones_column = self._product.split_k, self._of.dynamics
+        split, of = self._product.split_k, self._of
         for first, count in self._blocks(d_outputs):
             layers, features = self._activate(commands, first, count, inputs, weights)
             d, more = Matrix.of(d_outputs.rows(first, count)), first > 0
-            ones = Matrix.of(inputs["beside"].rows(first, count)).from_column(ones_column, 1)
-            d_biases = Matrix(d_heads.biases, self._of.outputs, 1, 1)
+            ones = Matrix.of(inputs["beside"].rows(first, count)).from_column(of.dynamics, 1)
             split(commands, d.transpose, features, Matrix.of(d_heads.weights), add=more)
-            split(commands, d.transpose, ones, d_biases, add=more)
+            split(commands, d.transpose, ones, Matrix(d_heads.biases, of.outputs, 1, 1), add=more)
             self._product(commands, d, Matrix.of(heads.weights), features)
             self._gate("gate_bwd", commands, count, weights, d_features=features.array, layers=layers.array)
-            d_biases = self._of.matrix(d_weights, "spatial.bias", self._of.channels, 1)
+            d_biases = Matrix(d_weights, of.channels, 1, 1, of.places["spatial.bias"].first)
             split(commands, layers.transpose, ones, d_biases, add=True)
             for each in self._products:
-                given, target = self._input(inputs, each, first, count), self._input(d_inputs, each, first, count)
-                own, d_own = layers.from_column(each.channel, each.channels), self._weights(d_weights, each)
-                split(commands, own.transpose, given, d_own, add=True)
-                self._product(commands, own, self._weights(weights, each), target)
+                own, given = layers.from_column(each.channel, each.channels), each.given(inputs, first, count)
+                split(commands, own.transpose, given, each.weights(d_weights), add=True)
+                self._product(commands, own, each.weights(weights), each.given(d_inputs, first, count))
 
-    def _input(self, inputs: Mapping[str, DeviceArray], product: _Product, first: int, count: int) -> Matrix:
-        return Matrix.of(inputs[product.input].rows(first, count)).from_column(0, product.columns)
-
-    def _weights(self, array: DeviceArray, product: _Product) -> Matrix:
-        row = self._of.places[product.parameter].shape[1]
-        whole = self._of.matrix(array, product.parameter, product.channels, row)
-        return whole.from_column(product.column, product.columns)
-
-    def _blocks(self, outputs: DeviceArray) -> Iterator[tuple[int, int]]:
+    def _blocks(self, outputs: DeviceArray) -> list[tuple[int, int]]:
+        """First Gaussian and number of Gaussians of each block."""
         n = outputs.shape[0]
-        return ((first, min(self._size, n - first)) for first in range(0, n, self._size))
+        return [(first, min(self._block, n - first)) for first in range(0, n, self._block)]
 
     def _activate(
         self, commands: Commands, first: int, count: int, inputs: Mapping[str, DeviceArray], weights: DeviceArray
     ) -> tuple[Matrix, Matrix]:
         """Return the outputs of the layers for a block, without biases, and the inputs of the heads."""
-        layers = Matrix.of(self.pool.array("layers", (count, self._of.channels)))
-        features = Matrix.of(self.pool.array("features", (count, self._of.placed)))
+        layers = Matrix.of(self._pool.array("layers", (count, self._of.channels)))
+        features = Matrix.of(self._pool.array("features", (count, self._of.placed)))
         if len(self._products) == 1:
             commands.clear(layers.array)  # the temporal channels have nothing but biases
         begun: set[int] = set()
         for each in self._products:
-            given, of = self._input(inputs, each, first, count), self._weights(weights, each).transpose
             own = layers.from_column(each.channel, each.channels)
-            self._product(commands, given, of, own, add=each.channel in begun)
+            given, matrix = each.given(inputs, first, count), each.weights(weights).transpose
+            self._product(commands, given, matrix, own, add=each.channel in begun)
             begun.add(each.channel)
         self._gate("gate", commands, count, weights, layers=layers.array, features=features.array)
         return layers, features
 
     def _gate(self, name: str, commands: Commands, count: int, weights: DeviceArray, **arrays: DeviceArray) -> None:
-        kernel, first = Kernel.get(self.device, name, MOTION=self._of.motion), self._of.places["spatial.bias"].first
-        content = kernel.uniform("Gate", gaussians=count, width=self._of.width, biases=first)
-        uniform = self.pool.constant(content)
-        commands.dispatch(kernel, -(-count * self._of.width // 64), gate=uniform, weights=weights, **arrays)
+        kernel, width = Kernel.get(self._device, name, MOTION=self._of.motion), self._of.width
+        biases = self._of.places["spatial.bias"].first
+        uniform = self._pool.constant(kernel.uniform("Gate", gaussians=count, width=width, biases=biases))
+        commands.dispatch(kernel, -(-count * width // 64), gate=uniform, weights=weights, **arrays)

@@ -58,14 +58,6 @@ class Comparison(NamedTuple):
     sums: list[DeviceArray]
 
 
-class _Group(NamedTuple):
-    """Grids that are encoded together. tables: theirs among all; features: of a point."""
-
-    encoder: HashEncoderPasses
-    tables: slice
-    features: int
-
-
 class GridFieldPasses:
     """Records the passes of a field that `decodes_on_device`."""
 
@@ -74,11 +66,9 @@ class GridFieldPasses:
         self.weights = FieldWeights(device, config)
         self.pool = BufferPool(device)
         self.samples = SamplePasses(device, self.pool)
-        static, temporal = static_grid(config), temporal_grids(config)
-        self._groups = [_Group(HashEncoderPasses(device, [static], config.bound), slice(1), static.features)]
-        if temporal:
-            encoder = HashEncoderPasses(device, temporal, config.bound)
-            self._groups.append(_Group(encoder, slice(1, None), self.weights.temporal))
+        self._encoders = [HashEncoderPasses(device, [static_grid(config)], config.bound)]
+        if temporal := temporal_grids(config):
+            self._encoders.append(HashEncoderPasses(device, temporal, config.bound, first_table=1))
         self._decoder = DecoderPasses(device, self.weights)
         self._device = device
 
@@ -125,7 +115,7 @@ class GridFieldPasses:
         kernel = Kernel.get(self._device, "smoothness")
         for group, (a, b) in enumerate(zip(here, there, strict=True)):
             total = self.pool.array(f"differences {group}", (count,))
-            uniform = self._smoothness(group, count, 0.0)
+            uniform = self._smoothness(a.shape[1], count, 0.0)
             commands.dispatch(kernel, -(-count // 64), smoothness=uniform, here=a, there=b, sums=total)
             sums.append(total)
         return Comparison(points, here, there, sums)
@@ -157,10 +147,9 @@ class GridFieldPasses:
         """Record the backward pass of differences. weights: of the sum of each group."""
         count = comparison.points[0].count
         kernel = Kernel.get(self._device, "smoothness_bwd")
-        for group, (here, there) in enumerate(zip(comparison.here, comparison.there, strict=True)):
-            uniform = self._smoothness(group, count, 2 * weights[group])
-            groups = -(-count * self._groups[group].features // 64)
-            commands.dispatch(kernel, groups, smoothness=uniform, here=here, there=there)
+        for here, there, weight in zip(comparison.here, comparison.there, weights, strict=False):
+            uniform = self._smoothness(here.shape[1], count, 2 * weight)
+            commands.dispatch(kernel, -(-here.size // 64), smoothness=uniform, here=here, there=there)
         for points, encodings in zip(comparison.points, (comparison.here, comparison.there), strict=True):
             self._encode_bwd(commands, points, encodings, gradients.tables)
 
@@ -174,19 +163,18 @@ class GridFieldPasses:
 
     def _encode(self, commands: Commands, points: PointSet, tables: list[DeviceArray]) -> list[DeviceArray]:
         found = []
-        for number, (encoder, own, features) in enumerate(self._groups):
-            encoding = self.pool.array(f"encoding {points.number} {number}", (points.count, features))
-            encoder.encode(commands, points, tables[own], encoding)
+        for number, encoder in enumerate(self._encoders):
+            encoding = self.pool.array(f"encoding {points.number} {number}", (points.count, encoder.features))
+            encoder.encode(commands, points, tables, encoding)
             found.append(encoding)
         return found
 
     def _encode_bwd(
         self, commands: Commands, points: PointSet, d_encodings: list[DeviceArray], d_tables: list[DeviceArray]
     ) -> None:
-        for (encoder, own, _), d_encoding in zip(self._groups, d_encodings, strict=True):
-            encoder.add_gradient(commands, points, d_encoding, d_tables[own])
+        for encoder, d_encoding in zip(self._encoders, d_encodings, strict=True):
+            encoder.add_gradient(commands, points, d_encoding, d_tables)
 
-    def _smoothness(self, group: int, pairs: int, scale: float) -> DeviceArray:
+    def _smoothness(self, features: int, pairs: int, scale: float) -> DeviceArray:
         kernel = Kernel.get(self._device, "smoothness")
-        content = kernel.uniform("Smoothness", pairs=pairs, features=self._groups[group].features, scale=scale)
-        return self.pool.constant(content)
+        return self.pool.constant(kernel.uniform("Smoothness", pairs=pairs, features=features, scale=scale))

@@ -93,13 +93,10 @@ class GridFieldPlayback:
         size = block or _BLOCK_BYTES // (4 * row) // _LANES * _LANES
         count = len(gaussians["means"])
         self._blocks = [self._block(gaussians, first, min(size, count - first)) for first in range(0, count, size)]
-        self._temporal = HashEncoderPasses(
-            device, temporal_grids(config), config.bound, row=4 * sizes.moving_quads, column=sizes.first_temporal
-        )
-        self._tables = [
-            self._pool.upload(f"table {i}", parameters[f"temporal_grids.{i}.table"])
-            for i in range(len(self._temporal.grids))
-        ]
+        grids, row = temporal_grids(config), 4 * sizes.moving_quads
+        self._temporal = HashEncoderPasses(device, grids, config.bound, row=row, column=sizes.first_temporal)
+        names = [f"temporal_grids.{i}.table" for i in range(len(grids))]
+        self._tables = [self._pool.upload(name, parameters[name]) for name in names]
         if "static_features" not in gaussians:
             self._encode_static(parameters["static_grid.table"])
         heads = self._heads(0.0)
