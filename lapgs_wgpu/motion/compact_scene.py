@@ -68,16 +68,14 @@ def compress(
     field: Mapping[str, Floats],
     config: FieldConfig,
     sh_degree: int,
-    look: InitialView | None = None,
-    *,
-    finer: float = 1.0,
+    look: InitialView | None,
+    finer: float,
 ) -> dict[str, NDArray[Any]]:
-    """Return the tensors of a compact scene.
+    """Return the tensors of a compact scene, without Gaussians that are too faint to be drawn at any time.
 
     gaussians: as SceneFile has them, and "static_features" (N, F) where the scene moves. field: as SceneFile has it.
-    look: from where and how near it is seen; by default, so near that only the Gaussians' own sizes count.
+    look: from where and how near it is seen; None: so near that only the Gaussians' own sizes count.
     finer: factor of the largest errors that are allowed.
-    Gaussians that are too faint to be drawn at any time are left out.
     """
     stored = {name: gaussians[name] for name in _BITS if name in gaussians}
     stored["log_scales"] = np.maximum(stored["log_scales"], np.float32(math.log(MIN_SCALE)))
@@ -124,13 +122,12 @@ def expand(
     """
     if config.kind != "static" and not config.decodes_on_device:
         raise InputError(f"{where}: its field {config.kind} is none that a compact scene can hold; the file is damaged")
-    reader = _Reader(tensors, where)
-    columns = row_columns(config, sh_degree)
     means = tensors.get("gaussians.means")
     count = means.shape[1] if means is not None and means.ndim == 2 else 0
     if not count:
         raise InputError(f"{where}: holds no Gaussians in its tensor 'gaussians.means'; the file is damaged")
-    gaussians = {name: reader.columns(f"gaussians.{name}", count, width) for name, width in columns.items()}
+    columns = row_columns(config, sh_degree)
+    gaussians = {name: _columns(tensors, f"gaussians.{name}", (width, count), where) for name, width in columns.items()}
     rest = np.zeros((count, 15, 3), np.float32)
     if sh_degree:
         rest[:, : (sh_degree + 1) ** 2 - 1] = gaussians["sh_rest"].reshape(count, -1, 3)
@@ -142,10 +139,10 @@ def expand(
     for name, shape in parameter_shapes(config).items():
         if name.endswith(".table"):
             if name != STATIC_TABLE:
-                field[name] = reader.columns(f"field.{name}", shape[0], shape[1], starts)
+                field[name] = _columns(tensors, f"field.{name}", shape[::-1], where, starts)
         else:
             code = "f4" if name in _EXACT else "f2"
-            field[name] = reader.tensor(f"field.{name}", shape, code).astype(np.float32)
+            field[name] = tensor_of(tensors, f"field.{name}", shape, where, code).astype(np.float32)
     return gaussians, field
 
 
@@ -198,39 +195,40 @@ def _table_starts(config: FieldConfig) -> list[int]:
     return [level.first for level in grids[0].levels] if grids else [0]
 
 
-class _Reader:
-    def __init__(self, tensors: Mapping[str, NDArray[Any]], where: str) -> None:
-        self._tensors, self._where = tensors, where
+def tensor_of(
+    tensors: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, ...], where: str, *codes: str
+) -> NDArray[Any]:
+    """Return a tensor of a file, of a type with one of these codes, if there are any. Raises InputError."""
+    array = tensors.get(name)
+    if array is None:
+        raise InputError(f"{where}: has no tensor {name!r}; the file is damaged, or of another version")
+    if array.shape != shape or (codes and array.dtype.str[1:] not in codes):
+        types = " or ".join(np.dtype(code).name for code in codes)
+        raise InputError(
+            f"{where}: tensor {name!r} has shape {array.shape} and type {array.dtype}, but the scene needs {shape} "
+            f"{types}; the file is damaged"
+        )
+    return array
 
-    def tensor(self, name: str, shape: tuple[int, ...], *codes: str) -> NDArray[Any]:
-        array = self._tensors.get(name)
-        if array is None:
-            raise InputError(f"{self._where}: has no tensor {name!r}; the file is damaged, or of another version")
-        if array.shape != shape or array.dtype.str[1:] not in codes:
-            raise InputError(
-                f"{self._where}: tensor {name!r} is {array.dtype} {array.shape}, but the scene needs "
-                f"{' or '.join(np.dtype(code).name for code in codes)} {shape}; the file is damaged"
-            )
-        return array
 
-    def _outliers(self, name: str, size: int) -> tuple[NDArray[np.uint32], Floats]:
-        """Return the places and values of those that are stored exactly, none in most files."""
-        places = self._tensors.get(f"{name}.outliers", np.zeros(0, np.uint32))
-        places = self.tensor(f"{name}.outliers", (places.size,), "u4") if places.size else places
-        values = self.tensor(f"{name}.exact", places.shape, "f4") if places.size else np.zeros(0, np.float32)
-        if places.size and (places[-1] >= size or (places[1:] <= places[:-1]).any()):
-            raise InputError(
-                f"{self._where}: tensor '{name}.outliers' does not count places from 0 to {size - 1} in ascending "
-                "order; the file is damaged"
-            )
-        return places, values
-
-    def columns(self, name: str, rows: int, columns: int, starts: Sequence[int] = (0,)) -> Floats:
-        """Return a dequantized tensor (rows, columns)."""
-        whole = self.tensor(name, (columns, rows), "u1", "u2", "f4")
-        ranges = self.tensor(f"{name}.range", (len(starts), columns, 2), "f4")
-        with np.errstate(over="ignore", invalid="ignore"):
-            values = dequantize(Quantized(whole, ranges, *self._outliers(name, whole.size)), starts)
-        if not np.isfinite(values).all():
-            raise InputError(f"{self._where}: tensor {name!r} has a range beyond float32; the file is damaged")
-        return values
+def _columns(
+    tensors: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, ...], where: str, starts: Sequence[int] = (0,)
+) -> Floats:
+    """Return a dequantized tensor (rows, columns). shape: (columns, rows)."""
+    whole = tensor_of(tensors, name, shape, where, "u1", "u2", "f4")
+    ranges = tensor_of(tensors, f"{name}.range", (len(starts), shape[0], 2), where, "f4")
+    places, exact = np.zeros(0, np.uint32), np.zeros(0, np.float32)
+    if f"{name}.outliers" in tensors:
+        size = (tensors[f"{name}.outliers"].size,)
+        places = tensor_of(tensors, f"{name}.outliers", size, where, "u4")
+        exact = tensor_of(tensors, f"{name}.exact", size, where, "f4")
+    if (places[-1:] >= whole.size).any() or (places[1:] <= places[:-1]).any():
+        raise InputError(
+            f"{where}: tensor '{name}.outliers' does not count places from 0 to {whole.size - 1} in ascending order; "
+            "the file is damaged"
+        )
+    with np.errstate(over="ignore", invalid="ignore"):
+        values = dequantize(Quantized(whole, ranges, places, exact), starts)
+    if not np.isfinite(values).all():
+        raise InputError(f"{where}: tensor {name!r} has a range beyond float32; the file is damaged")
+    return values

@@ -18,8 +18,10 @@ from lapgs_wgpu.io.ply import GaussianSnapshot
 from lapgs_wgpu.motion.fields.config import MIN_SCALE, FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation, Deformed, Field, Nearby, TimeSamples
 from lapgs_wgpu.motion.fields.grid_field import GridField
+from lapgs_wgpu.motion.fields.hexplane_field import HexPlaneField
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion
-from lapgs_wgpu.motion.fields.make_field import check_own, make_field
+from lapgs_wgpu.motion.fields.mlp_field import MlpField
+from lapgs_wgpu.motion.fields.own_field import OwnField, check_own
 from lapgs_wgpu.motion.scene_file import SceneFile, read_scene, row_shapes, scene_header
 from lapgs_wgpu.motion.timing import EVEN, Timing
 from lapgs_wgpu.splat.camera import Camera
@@ -46,6 +48,17 @@ def isotropic_rows(
         / CONSTANTS["SH_C0"],
         "sh_rest": torch.zeros(n, 15, 3),
     }
+
+
+def make_field(config: FieldConfig, device: Device, seed: int = 0, own: nn.Module | None = None) -> Field | None:
+    """Make the field of this configuration; None for static scenes. own: the module of the field own."""
+    if own is not None:
+        return OwnField(own)
+    if config.kind == "mlp":
+        return MlpField(config, seed)
+    if config.kind == "hexplane":
+        return HexPlaneField(config, seed)
+    return None if config.kind == "static" else GridField(config, device, seed)
 
 
 class Scene4D:

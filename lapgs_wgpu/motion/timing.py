@@ -52,11 +52,8 @@ EVEN = Timing(np.zeros(0), np.zeros(0))
 
 
 def timing_of_text(text: str) -> Timing:
-    """Return the timing that `to_text` wrote. Raises ValueError."""
+    """Return the timing that `to_text` wrote. Raises ValueError, or TypeError where the entries are no numbers."""
     table = parse_json(text, "its timing")
     if not isinstance(table, dict) or table.keys() != {"times", "moments"}:
         raise ValueError("timing is no table of times and moments")
-    for name, values in table.items():
-        if not isinstance(values, list) or not values or not all(type(each) in (int, float) for each in values):
-            raise ValueError(f"timing.{name} are not numbers between 0 and 1")
     return Timing(**{name: np.array(values, np.float64) for name, values in table.items()})

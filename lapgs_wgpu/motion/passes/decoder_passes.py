@@ -127,7 +127,7 @@ class FieldWeights:
 
 class _Product(NamedTuple):
     """An addend of the layers: the first `columns` columns of an input, times a matrix (channels, columns) of the
-    weights, give `channels` channels from `channel` on. first, stride: of that matrix."""
+    weights, give `channels` channels from `channel` on. first, stride: of that matrix. add: not the first of these."""
 
     input: str
     columns: int
@@ -135,6 +135,7 @@ class _Product(NamedTuple):
     channels: int
     first: int
     stride: int
+    add: bool = False
 
     def weights(self, array: DeviceArray) -> Matrix:
         """The matrix in the array of weights, or its place in that of their gradients."""
@@ -161,7 +162,7 @@ class DecoderPasses:
         products = [
             _Product("static", layers.static, 0, placed, spatial, layers.static),
             _Product("beside", dynamics, placed, width, temporal, row),
-            _Product("temporal", layers.temporal, placed, width, temporal + dynamics, row),
+            _Product("temporal", layers.temporal, placed, width, temporal + dynamics, row, add=dynamics > 0),
         ]
         self._products = [each for each in products if each.columns]
 
@@ -221,12 +222,10 @@ class DecoderPasses:
         features = Matrix.of(self._pool.array("features", (count, self._of.placed)))
         if len(self._products) == 1:
             commands.clear(layers.array)  # the temporal channels have nothing but biases
-        begun: set[int] = set()
         for each in self._products:
             own = layers.from_column(each.channel, each.channels)
             given, matrix = each.given(inputs, first, count), each.weights(weights).transpose
-            self._product(commands, given, matrix, own, add=each.channel in begun)
-            begun.add(each.channel)
+            self._product(commands, given, matrix, own, add=each.add)
         self._gate("gate", commands, count, weights, layers=layers.array, features=features.array)
         return layers, features
 
