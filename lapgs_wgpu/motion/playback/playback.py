@@ -15,7 +15,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.io.ply import GaussianSnapshot
 from lapgs_wgpu.motion.fields.config import MIN_SCALE
-from lapgs_wgpu.motion.playback.grid_field_playback import GridFieldPlayback, runs_on_device
+from lapgs_wgpu.motion.playback.grid_field_playback import GridFieldPlayback
 from lapgs_wgpu.motion.scene_file import SceneFile
 from lapgs_wgpu.splat.gaussians import Gaussians
 
@@ -46,11 +46,11 @@ class Playback(Protocol):
 def playback_of(file: SceneFile, device: Device) -> Playback:
     """Playback of a file that was read.
 
-    torch is imported only for the fields mlp and hexplane, for hidden layers, and for the ablation of the motion.
+    torch is imported only for fields that do not `decodes_on_device`.
     Raises MemoryError if a buffer of all Gaussians exceeds the device's limits. The colors are the largest one: 1.4
     million Gaussians of degree 3 at WebGPU's default limits.
     """
-    if file.field_config.kind == "static" or runs_on_device(file.field_config, device):
+    if file.field_config.kind == "static" or file.field_config.decodes_on_device:
         return DevicePlayback(file, device)
     from lapgs_wgpu.motion.playback.torch_playback import TorchPlayback
     from lapgs_wgpu.motion.scene import scene_of
@@ -67,8 +67,7 @@ class DevicePlayback:
         self.moves = file.field_config.kind != "static"
         activated = activate(file.gaussians, file.sh_degree)
         pool = BufferPool(device)
-        names = {"means": "means", "quats": "quats", "scales": "scales", "opacities": "opacities", "sh": "colors"}
-        arrays = {name: pool.upload(name, activated[of]) for name, of in names.items()}
+        arrays = {name: pool.upload(name, activated[name]) for name in ("means", "quats", "scales", "opacities", "sh")}
         self._now = Gaussians(**arrays, antialiased=file.antialiased)
         self._field: GridFieldPlayback | None = None
         self._time: float | None = None  # of the Gaussians in the buffers, where a field moves them
@@ -105,7 +104,7 @@ def activate(stored: dict[str, Floats], sh_degree: int) -> dict[str, Floats]:
         "quats": quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12),
         "scales": scales,
         "opacities": 0.5 + 0.5 * np.tanh(0.5 * stored["opacity_logits"]),
-        "colors": np.concatenate([stored["sh_dc"], stored["sh_rest"][:, :used]], axis=1),
+        "sh": np.concatenate([stored["sh_dc"], stored["sh_rest"][:, :used]], axis=1),
     }
 
 
