@@ -15,7 +15,7 @@ from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.config import FieldConfig, static_grid, temporal_grids
 from lapgs_wgpu.motion.passes.decoder_passes import DecoderPasses, FieldWeights, Heads, Time
 from lapgs_wgpu.motion.passes.hash_encoder_passes import HashEncoderPasses, PointSet
-from lapgs_wgpu.motion.passes.samples import SamplePasses, Samples, Sampling
+from lapgs_wgpu.motion.passes.samples import SamplePasses, Sampling
 
 
 class FieldArrays(NamedTuple):
@@ -32,14 +32,13 @@ class FieldArrays(NamedTuple):
 
 
 class Decoding(NamedTuple):
-    """Gaussians at a time that were decoded. name: distinguishes them.
+    """Gaussians at a time that were decoded.
 
     time: gives that of the field, in [0, 1]. sampling: gives those of the Gaussians; None for all, in their order.
     points, inputs: of encoder and decoder. heads: at that time. outputs: (count, outputs) of the heads, without their
     biases; before `backward` they become their gradient.
     """
 
-    name: str
     time: Time
     sampling: Sampling | None
     points: PointSet
@@ -64,15 +63,13 @@ class GridFieldPasses:
     def __init__(self, device: Device, config: FieldConfig) -> None:
         self.config = config
         self.weights = FieldWeights(device, config)
-        self.pool = BufferPool(device)
-        self.samples = SamplePasses(device, self.pool)
+        self._pool = BufferPool(device)
+        self._samples = SamplePasses(device, self._pool)
         self._encoders = [HashEncoderPasses(device, [static_grid(config)], config.bound)]
         if temporal := temporal_grids(config):
             self._encoders.append(HashEncoderPasses(device, temporal, config.bound, first_table=1))
         self._decoder = DecoderPasses(device, self.weights)
         self._device = device
-
-    # Forward ---------------------------------------------------------------------------------------------------------
 
     def decode(
         self, commands: Commands, number: int, arrays: FieldArrays, t: Time, sampling: Sampling | None = None
@@ -81,18 +78,17 @@ class GridFieldPasses:
 
         number: distinguishes the times that are submitted together, from 0 on.
         """
-        name = f"decoded {number}"
         points = self._points(commands, number, sampling, arrays, t)
         encodings = self._encode(commands, points, arrays.tables)
         beside = arrays.beside
         if sampling is not None:
-            beside = self.pool.array(f"beside {number}", (points.count, beside.shape[1]))
-            self.samples.rows(commands, f"set {number}", sampling, arrays.beside, beside, back=False)
-        heads = self.weights.heads_at(commands, arrays.weights, name, t)
+            beside = self._pool.array(f"beside {number}", (points.count, beside.shape[1]))
+            self._samples.rows(commands, f"set {number}", sampling, arrays.beside, beside, back=False)
+        heads = self.weights.heads_at(commands, arrays.weights, f"decoded {number}", t)
         inputs = dict(zip(("beside", "static", "temporal"), [beside, *encodings], strict=False))
-        outputs = self.pool.array(f"outputs {number}", (points.count, self.weights.outputs))
+        outputs = self._pool.array(f"outputs {number}", (points.count, self.weights.outputs))
         self._decoder.decode(commands, inputs, arrays.weights, heads, outputs)
-        return Decoding(name, t, sampling, points, inputs, heads, outputs)
+        return Decoding(t, sampling, points, inputs, heads, outputs)
 
     def compare(
         self, commands: Commands, number: int, arrays: FieldArrays, t: Time, near: Sampling, near_time: Time
@@ -102,44 +98,34 @@ class GridFieldPasses:
         number: as for `decode`; the next one is taken, too.
         """
 
-        def at_means() -> Samples:
-            return replace(near(), reach=0.0)
-
-        points = (
-            self._points(commands, number, at_means, arrays, t),
-            self._points(commands, number + 1, near, arrays, near_time),
-        )
-        here, there = (self._encode(commands, each, arrays.tables) for each in points)
-        count = points[0].count
-        sums = []
+        means = self._points(commands, number, lambda: replace(near(), reach=0.0), arrays, t)
+        places = self._points(commands, number + 1, near, arrays, near_time)
+        here, there = (self._encode(commands, points, arrays.tables) for points in (means, places))
+        count, sums = means.count, []
         kernel = Kernel.get(self._device, "smoothness")
         for group, (a, b) in enumerate(zip(here, there, strict=True)):
-            total = self.pool.array(f"differences {group}", (count,))
+            total = self._pool.array(f"differences {group}", (count,))
             uniform = self._smoothness(a.shape[1], count, 0.0)
             commands.dispatch(kernel, -(-count // 64), smoothness=uniform, here=a, there=b, sums=total)
             sums.append(total)
-        return Comparison(points, here, there, sums)
-
-    # Backward --------------------------------------------------------------------------------------------------------
+        return Comparison((means, places), here, there, sums)
 
     def decode_bwd(self, commands: Commands, decoding: Decoding, arrays: FieldArrays, gradients: FieldArrays) -> None:
         """Record the backward pass, from the outputs, which have become their gradient.
 
         The gradient of `beside` is written for all Gaussians, and added for samples.
         """
-        d_beside = gradients.beside
+        d_beside, d_heads, number = gradients.beside, self.weights.heads("gradient"), decoding.points.number
         if decoding.sampling is not None:
-            d_beside = self.pool.array("d_beside", decoding.inputs["beside"].shape)
-        d_heads = self.weights.heads("gradient")
+            d_beside = self._pool.array("d_beside", decoding.inputs["beside"].shape)
         inputs, d_weights = decoding.inputs, gradients.weights
         given = inputs, arrays.weights, decoding.heads, decoding.outputs
         self._decoder.decode_bwd(commands, *given, inputs | {"beside": d_beside}, d_weights, d_heads)
         if decoding.sampling is not None:
-            number = decoding.points.number
-            self.samples.rows(commands, f"set {number}", decoding.sampling, gradients.beside, d_beside, back=True)
+            self._samples.rows(commands, f"set {number}", decoding.sampling, gradients.beside, d_beside, back=True)
         encodings = [array for name, array in inputs.items() if name != "beside"]
         self._encode_bwd(commands, decoding.points, encodings, gradients.tables)
-        self.weights.heads_bwd(commands, arrays.weights, d_weights, d_heads, decoding.name, decoding.time)
+        self.weights.heads_bwd(commands, arrays.weights, d_weights, d_heads, f"decoded {number}", decoding.time)
 
     def compare_bwd(
         self, commands: Commands, comparison: Comparison, gradients: FieldArrays, weights: list[float]
@@ -153,18 +139,16 @@ class GridFieldPasses:
         for points, encodings in zip(comparison.points, (comparison.here, comparison.there), strict=True):
             self._encode_bwd(commands, points, encodings, gradients.tables)
 
-    # Parts -----------------------------------------------------------------------------------------------------------
-
     def _points(
         self, commands: Commands, number: int, sampling: Sampling | None, arrays: FieldArrays, t: Time
     ) -> PointSet:
-        array = self.samples.places(commands, f"set {number}", sampling, arrays.geometry)
+        array = self._samples.places(commands, f"set {number}", sampling, arrays.geometry)
         return PointSet(number, array, array.shape[0], lambda: self.config.grid_time(t()))
 
     def _encode(self, commands: Commands, points: PointSet, tables: list[DeviceArray]) -> list[DeviceArray]:
         found = []
         for number, encoder in enumerate(self._encoders):
-            encoding = self.pool.array(f"encoding {points.number} {number}", (points.count, encoder.features))
+            encoding = self._pool.array(f"encoding {points.number} {number}", (points.count, encoder.features))
             encoder.encode(commands, points, tables, encoding)
             found.append(encoding)
         return found
@@ -177,4 +161,4 @@ class GridFieldPasses:
 
     def _smoothness(self, features: int, pairs: int, scale: float) -> DeviceArray:
         kernel = Kernel.get(self._device, "smoothness")
-        return self.pool.constant(kernel.uniform("Smoothness", pairs=pairs, features=features, scale=scale))
+        return self._pool.constant(kernel.uniform("Smoothness", pairs=pairs, features=features, scale=scale))
