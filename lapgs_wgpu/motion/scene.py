@@ -219,12 +219,11 @@ class Scene4D:
         if move.d_opacity is not None:
             opacities = (p["opacity_logits"] + move.d_opacity).sigmoid()
         means, scales = self._moved(move, canonical.means, canonical.scales)
-        at_times = []
-        if time_samples is not None:
-            rows = p["means"][time_samples.rows], canonical.scales[time_samples.rows]
-            at_times = [self._moved(other, *rows) for other in others]
         gaussians = Gaussians(means, quats, scales, opacities, sh, antialiased=self.antialiased)
-        return Deformed(gaussians, move.smoothness, at_times)
+        if time_samples is None:
+            return Deformed(gaussians, move.smoothness, [])
+        rows = p["means"][time_samples.rows], canonical.scales[time_samples.rows]
+        return Deformed(gaussians, move.smoothness, [self._moved(other, *rows) for other in others])
 
     def _moved(self, move: Deformation, means: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
         if move.d_scales is not None:

@@ -26,15 +26,14 @@ class Timing:
     moments: NDArray[np.float64]
 
     def __post_init__(self) -> None:
-        for name, values in vars(self).items():
-            if values.ndim != 1 or values.dtype != np.float64 or not ((values >= 0) & (values <= 1)).all():
-                raise ValueError(f"timing.{name} are not numbers between 0 and 1")
-        if len(self.times) != len(self.moments):
-            raise ValueError(f"timing has {len(self.times)} times and {len(self.moments)} moments")
-        if (np.diff(self.times) <= 0).any():
-            raise ValueError("timing.times do not ascend")
-        if (np.diff(self.moments) < 0).any():
-            raise ValueError("timing.moments descend")
+        for values in (self.times, self.moments):
+            fits = values.shape == (self.times.size,) and values.dtype == np.float64
+            if not (fits and ((values >= 0) & (values <= 1)).all() and (np.diff(values) >= 0).all()):
+                raise ValueError(
+                    "timing.times and timing.moments must be as many numbers from 0 to 1 that never descend"
+                )
+        if not np.diff(self.times).all():
+            raise ValueError("timing.times must be different")
 
     def __call__(self, t: float) -> float:
         """Return the moment at a time in [0, 1]; at others that of the nearest end. Raises ValueError for NaN."""

@@ -7,10 +7,9 @@ from torch import Tensor, nn
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import GEOMETRY, TEMPORAL_AXES, FieldConfig
-from lapgs_wgpu.motion.fields.deformation import Deformation, Field, Nearby, TimeSamples
+from lapgs_wgpu.motion.fields.deformation import Deformation, Field, Nearby, TimeSamples, linear, zero_head
 from lapgs_wgpu.motion.fields.hash_encoder import HashEncoder, HashGrid
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion, TimeMotion
-from lapgs_wgpu.motion.fields.layers import linear, zero_head
 from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
 from lapgs_wgpu.motion.fields.torch_decoder import DecoderWeights, decode
 
@@ -145,14 +144,6 @@ class GridField(Field):
 
     def _head_factors(self) -> Tensor:
         return self.heads.bias.new_tensor(self.config.head_factors)
-
-    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """See motion/fields/deformation.py. The spectrum's frequencies, in no group, have their own optimizer."""
-        tables = [grid.table for grid in self.grids]
-        excluded = {id(table) for table in tables}
-        if isinstance(self.motion, LaplacianMotion):
-            excluded.add(id(self.motion.frequencies))
-        return {"hash": tables, "mlp": [p for p in self.parameters() if id(p) not in excluded]}
 
 
 def _smoothness(here: list[Tensor], near: list[Tensor], nearby: Nearby) -> Tensor:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from lapgs_wgpu.motion.fields.config import FieldConfig
-from lapgs_wgpu.motion.fields.layers import linear
+from lapgs_wgpu.motion.fields.deformation import linear
 
 VARIANCE_FLOOR = 1e-4
 # A component's variance counts as at most this times the geometric mean of all, and at least 1 / this.

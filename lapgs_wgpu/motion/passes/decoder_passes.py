@@ -27,9 +27,6 @@ _BIASES = 20  # floats of the heads' biases, as activate.wgsl binds them
 _FIRST = [f"{name}.weight" for name in ("spatial", "motion.first", "heads", "appearance")]
 _FIRST += [f"{name}.bias" for name in ("spatial", "motion.first", "temporal", "heads", "appearance")]
 _LAST = "motion.frequencies"  # which has an optimizer of its own
-_SPECTRUM = {"second": "motion.second.weight", "second_bias": "motion.second.bias"} | {
-    name: f"motion.{name}" for name in ("alpha", "beta", "frequencies")
-}
 
 Time = Callable[[], float]  # gives that of the step that is taken, in [0, 1]
 
@@ -56,8 +53,10 @@ class FieldWeights:
     """The weights of a field that `decodes_on_device`, and the passes from them to the heads and back.
 
     width: channels of a layer. dynamics, static, temporal: columns of the layers' inputs; the first and the last may be
-    0. outputs: of the heads. motion: whether there is the inner layer of the Laplacian motion. places: by name of each
-    parameter but the tables its place in the array of weights. count: numbers of that array, the frequencies last.
+    0. outputs: of the heads. motion: whether there is the inner layer of the Laplacian motion. placed: channels that
+    depend on the static features; the heads read as many. channels: of all layers: spatial, the motion's inner ones,
+    temporal. places: by name of each parameter but the tables its place in the array of weights. count: numbers of that
+    array, the frequencies last.
     """
 
     def __init__(self, device: Device, config: FieldConfig) -> None:
@@ -65,6 +64,8 @@ class FieldWeights:
         self.width, self.dynamics, self.static = config.width, config.dynamics_size, static_grid(config).features
         self.temporal = sum(grid.features for grid in temporal_grids(config))
         self.outputs, self.motion = sum(GEOMETRY) + config.appearance_size, config.kind == "laplacian"
+        self.placed = self.width * (2 if self.motion else 1)
+        self.channels = self.placed + self.width
         shapes = {name: shape for name, shape in parameter_shapes(config).items() if not name.endswith(".table")}
         order = [*_FIRST, *(name for name in shapes if name not in (*_FIRST, _LAST)), _LAST]
         self.places: dict[str, Segment] = {}
@@ -72,16 +73,6 @@ class FieldWeights:
         for name in (name for name in order if name in shapes):
             self.places[name] = Segment(self.count, shapes[name])
             self.count += math.prod(shapes[name])
-
-    @property
-    def placed(self) -> int:
-        """Number of channels that depend on the static features; the heads read as many."""
-        return self.width * (2 if self.motion else 1)
-
-    @property
-    def channels(self) -> int:
-        """Number of channels of all layers: spatial, the motion's inner ones, temporal."""
-        return self.placed + self.width
 
     def heads(self, name: str) -> Heads:
         """Arrays for heads, or for their gradients, by name."""
@@ -117,11 +108,14 @@ class FieldWeights:
         return self._pool.array(f"series {name}", (self.width,))
 
     def _spectrum(self, name: str, t: Time) -> DeviceArray:
-        kernel, of = Kernel.get(self._device, "spectrum"), self.places
-        given = {key: of[parameter].first if parameter in of else 0 for key, parameter in _SPECTRUM.items()}
+        """Return the uniform of the spectrum at a time, with the places of what is folded into the heads."""
+        kernel = Kernel.get(self._device, "spectrum")
+        names = {key: f"motion.{key}" for key in ("alpha", "beta", "frequencies")}
+        names |= {"second": "motion.second.weight", "second_bias": "motion.second.bias"}
+        names |= {"heads": "heads.weight", "head_biases": "heads.bias"}
+        given = {key: self.places[of].first if of in self.places else 0 for key, of in names.items()}
         given |= {"width": self.width, "components": self.config.components, "columns": self.placed}
-        given |= {"outputs": self.outputs, "heads": of["heads.weight"].first, "head_biases": of["heads.bias"].first}
-        factors = {"unit": self.config.unit, "appearance": APPEARANCE_SCALE}
+        factors = {"outputs": self.outputs, "unit": self.config.unit, "appearance": APPEARANCE_SCALE}
         return self._pool.varying(f"spectrum {name}", lambda: kernel.uniform("Spectrum", time=t(), **factors, **given))
 
 

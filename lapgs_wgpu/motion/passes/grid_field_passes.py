@@ -97,7 +97,6 @@ class GridFieldPasses:
 
         number: as for `decode`; the next one is taken, too.
         """
-
         means = self._points(commands, number, lambda: replace(near(), reach=0.0), arrays, t)
         places = self._points(commands, number + 1, near, arrays, near_time)
         here, there = (self._encode(commands, points, arrays.tables) for points in (means, places))

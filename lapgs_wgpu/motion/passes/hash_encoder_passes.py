@@ -17,7 +17,7 @@ from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import SOFTWARE_LOOP_TURNS, Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
-from lapgs_wgpu.motion.fields.hash_grid_config import TIME, GridShape
+from lapgs_wgpu.motion.fields.hash_grid_config import GridShape
 
 _ALIGNED = 64  # rows; a multiple of 256 bytes for every row size, at which a binding may begin
 _LEVEL_WORDS = 16  # common/hashgrid.wgsl: struct Level
@@ -39,9 +39,8 @@ class PointSet:
 
 @dataclass(frozen=True)
 class _Levels:
-    """Levels that one dispatch takes. name: distinguishes them. cells: of the largest level's plane."""
+    """Levels that one dispatch takes. cells: of the largest level's plane."""
 
-    name: str
     defines: dict[str, int]
     count: int
     cells: int
@@ -73,7 +72,6 @@ class HashEncoderPasses:
         self._lane_levels = device.is_cpu
         self._group_points, self._group_cells = (2048, 1024) if self._lane_levels else (512, 64)
         self._row = self.features if row is None else row
-        self._timed = any(grid.axes[2] == TIME for grid in grids)
         self._cuts: dict[int, _Levels] = {}  # by table: the levels that are sliced
         self._direct: dict[int, _Levels] = {}  # by table: the others
         self._slices: _Levels | None = None  # those that are sliced, of all grids
@@ -83,19 +81,19 @@ class HashEncoderPasses:
             words = _level_words(grid, column // 2, self._slice_entries)
             sliced = np.isin(np.arange(len(words)), grid.sliced)
             if sliced.any():
-                self._cuts[number] = self._levels(f"cut {number}", True, words[sliced])
+                self._cuts[number] = self._levels(words[sliced], sliced=True)
                 of_slices.append(words[sliced])
             if not sliced.all():
-                self._direct[number] = self._levels(f"direct {number}", False, words[~sliced])
+                self._direct[number] = self._levels(words[~sliced], sliced=False)
             self._slice_entries += int(words[sliced, 4:6].prod(axis=1).sum())
             column += grid.features
         if of_slices:
-            self._slices = self._levels("slices", True, np.concatenate(of_slices))
+            self._slices = self._levels(np.concatenate(of_slices), sliced=True)
 
-    def _levels(self, name: str, sliced: bool, words: NDArray[np.uint32]) -> _Levels:
-        array = DeviceArray.upload(self._device, f"levels {name}", words)
+    def _levels(self, words: NDArray[np.uint32], *, sliced: bool) -> _Levels:
+        array = DeviceArray.upload(self._device, "levels", words)
         defines = {"SLICED": 1, "CORNERS": 4} if sliced else {"CORNERS": 8}
-        return _Levels(name, defines, len(words), int(words[:, 4:6].prod(axis=1).max()), array)
+        return _Levels(defines, len(words), int(words[:, 4:6].prod(axis=1).max()), array)
 
     def _lookups(self, slices: DeviceArray, tables: Sequence[DeviceArray]) -> list[tuple[_Levels, DeviceArray]]:
         """Return the levels of each lookup, with what they are looked up in, or with its gradient."""
@@ -106,8 +104,6 @@ class HashEncoderPasses:
         """Return the uniform of a block; each has its own, since all blocks of all sets are submitted together."""
         kernel = Kernel.get(self._device, "hashgrid_slice")
         sizes = {"points": count, "all_points": points.count, "all_levels": self._row // 2, "bound": self._bound}
-        if not self._timed:
-            return self._pool.constant(kernel.uniform("Grid", time=0.0, **sizes))
         name = f"grid {points.number} from {first}"
         return self._pool.varying(name, lambda: kernel.uniform("Grid", time=points.time(), **sizes))
 
@@ -149,7 +145,8 @@ class HashEncoderPasses:
         sums = floats = self._lookups(d_slices, d_tables)
         of_all: dict[str, DeviceArray] = {"grid": blocks[0][2]}
         if not self._lane_levels:
-            sums = [(of, self._pool.array(f"d_fixed {of.name}", (2 * d.size,), "uint32")) for of, d in floats]
+            named = enumerate(floats)
+            sums = [(of, self._pool.array(f"d_fixed {i}", (2 * d.size,), "uint32")) for i, (of, d) in named]
             of_all["largest"] = self._largest(commands, points, d_encoding)
         for first, count, grid in blocks:
             arrays = {"points": points.array.rows(first, count), "d_encoding": d_encoding.rows(first, count)}
