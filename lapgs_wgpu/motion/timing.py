@@ -15,11 +15,10 @@ MOST_TIMES = 20_000  # that the header of a checkpoint has room for
 
 @dataclass(frozen=True, eq=False)
 class Timing:
-    """The moment of the motion at each time of the clip, both in [0, 1].
+    """The moment of the motion at each time of the clip, both in [0, 1]. Raises ValueError for others.
 
     times: (M,) float64, ascending. With none, each time is its own moment. moments: (M,) float64, never descending:
-    those at these times. Between two times the difference of moment and time changes evenly; outside of all it is that
-    of the nearest time. Raises ValueError for others.
+    those at these times. Between two times the difference changes evenly; outside of all it is that of the nearest.
     """
 
     times: NDArray[np.float64]

@@ -199,9 +199,8 @@ class ResidentPasses:
         decoding, comparison, line = decodings
         values, gradients = self.parameters.arrays("value"), self.parameters.arrays("gradient")
         if line is not None:
-            accelerations = passes.acceleration(commands, line, values.geometry, drawn)
+            accelerations = passes.acceleration(commands, line, values.geometry, drawn, by_drawn, gradients.geometry)
             self._total(commands, accelerations, "acceleration", line.scale, totals)
-            passes.acceleration_bwd(commands, line, values.geometry, drawn, by_drawn, gradients.geometry)
         d_sh = self.parameters.blocks["sh"].arrays["gradient"]
         passes.activate_bwd(commands, values.geometry, drawn, by_drawn, decoding, gradients.geometry, d_sh)
         if field is None or decoding is None:

@@ -84,14 +84,6 @@ class ActivationPasses:
         self._colors(commands, decoding, arrays, back=True)
 
     def acceleration(
-        self, commands: Commands, line: Line, geometry: DeviceArray, drawn: Gaussians[DeviceArray]
-    ) -> DeviceArray:
-        """Record the acceleration loss of each sample, without its weight: (count,)."""
-        values = self._pool.array("accelerations", (line.before.points.count,))
-        self._line(commands, "acceleration", line, {"geometry": geometry, "values": values}, drawn)
-        return values
-
-    def acceleration_bwd(
         self,
         commands: Commands,
         line: Line,
@@ -99,32 +91,28 @@ class ActivationPasses:
         drawn: Gaussians[DeviceArray],
         by_drawn: GaussianGradients,
         d_geometry: DeviceArray,
-    ) -> None:
-        """Record its gradients: added to those of the Gaussians; the outputs of both decodings become theirs."""
-        arrays = {"geometry": geometry, "d_geometry": d_geometry}
-        arrays |= {"d_means": by_drawn.means, "d_scales": by_drawn.scales}
-        self._line(commands, "acceleration_bwd", line, arrays, drawn)
+    ) -> DeviceArray:
+        """Record the acceleration loss of each sample, without its weight: (count,).
 
-    def _line(
-        self,
-        commands: Commands,
-        name: str,
-        line: Line,
-        arrays: dict[str, DeviceArray],
-        drawn: Gaussians[DeviceArray],
-    ) -> None:
-        kernel, (now, before, after, scale) = Kernel.get(self._device, name), line
+        Its gradients are added to those of the Gaussians; the outputs of both decodings become theirs.
+        """
+        (now, before, after, scale), kernel = line, Kernel.get(self._device, "acceleration")
         assert before.sampling is not None
 
         def write() -> bytes:
             share = (now.time() - before.time()) / (after.time() - before.time())
             return kernel.uniform("Acceleration", outputs=self._outputs, mirror=self._mirror, share=share, scale=scale)
 
+        values = self._pool.array("accelerations", (before.points.count,))
+        arrays = {"geometry": geometry, "d_geometry": d_geometry, "values": values}
         arrays |= {"means": drawn.means, "scales": drawn.scales, "before": before.outputs, "after": after.outputs}
+        arrays |= {"d_means": by_drawn.means, "d_scales": by_drawn.scales}
         arrays |= {"biases_before": before.heads.biases, "biases_after": after.heads.biases}
         arrays["samples"] = self._samples.uniform("line", before.sampling)
         arrays["acceleration"] = self._pool.varying("acceleration", write)
-        commands.run(kernel, -(-before.points.count // 64), arrays)
+        for name in ("acceleration", "acceleration_bwd"):
+            commands.run(Kernel.get(self._device, name), -(-before.points.count // 64), arrays)
+        return values
 
     def _geometry(self, commands: Commands, name: str, decoding: Decoding | None, arrays: Mapping[str, Any]) -> None:
         """Record `activate` or `activate_bwd`."""

@@ -20,7 +20,7 @@ from lapgs_wgpu.splat.constants import CONSTANTS
 
 Floats = NDArray[np.floating]
 
-SAMPLES = 128  # of the clip at least; a field's spectrum has up to 16 cycles
+_SAMPLES = 128  # of the clip at least; a field's spectrum has up to 16 cycles
 _PIECE_SAMPLES = 8  # of a piece at least
 _SHORTEST = 2.0**-9  # of the clip: shorter pieces are not halved
 _BLOCK = 1 << 21  # samples at once: 0.1 GB
@@ -56,10 +56,10 @@ def linear_pieces(playback: Playback, farthest: float, shade: float, done: Calla
     called with the share that is done, now and then.
     """
     found: list[tuple[Floats, ...]] = []
-    size = _BLOCK // SAMPLES
+    size = _BLOCK // _SAMPLES
     for first in range(0, playback.count, size):
         block = np.arange(first, min(first + size, playback.count))
-        values = np.stack([state(playback, t, block) for t in np.linspace(0, 1, SAMPLES + 1).tolist()])
+        values = np.stack([state(playback, t, block) for t in np.linspace(0, 1, _SAMPLES + 1).tolist()])
         for piece in _halve(playback, values, block, 0.0, 1.0, farthest, shade):
             found.append(piece)
             done((first + len(block) * float(piece[1].max(initial=0))) / playback.count)
