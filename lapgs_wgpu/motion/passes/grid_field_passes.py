@@ -5,6 +5,7 @@ Everything stays in device arrays. Gradients are added to arrays that the caller
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -47,16 +48,6 @@ class Decoding(NamedTuple):
     outputs: DeviceArray
 
 
-class Comparison(NamedTuple):
-    """Features of sampled Gaussians, and of places and a time near them, for each group of grids. sums: (count,)
-    squared differences of each."""
-
-    points: tuple[PointSet, PointSet]
-    here: list[DeviceArray]
-    there: list[DeviceArray]
-    sums: list[DeviceArray]
-
-
 class GridFieldPasses:
     """Records the passes of a field that `decodes_on_device`."""
 
@@ -90,25 +81,6 @@ class GridFieldPasses:
         self._decoder.decode(commands, inputs, arrays.weights, heads, outputs)
         return Decoding(t, sampling, points, inputs, heads, outputs)
 
-    def compare(
-        self, commands: Commands, number: int, arrays: FieldArrays, t: Time, near: Sampling, near_time: Time
-    ) -> Comparison:
-        """Record the features of samples at a time, and of places near them at another time, and their differences.
-
-        number: as for `decode`; the next one is taken, too.
-        """
-        means = self._points(commands, number, lambda: replace(near(), reach=0.0), arrays, t)
-        places = self._points(commands, number + 1, near, arrays, near_time)
-        here, there = (self._encode(commands, points, arrays.tables) for points in (means, places))
-        count, sums = means.count, []
-        kernel = Kernel.get(self._device, "smoothness")
-        for group, (a, b) in enumerate(zip(here, there, strict=True)):
-            total = self._pool.array(f"differences {group}", (count,))
-            uniform = self._smoothness(a.shape[1], count, 0.0)
-            commands.dispatch(kernel, -(-count // 64), smoothness=uniform, here=a, there=b, sums=total)
-            sums.append(total)
-        return Comparison((means, places), here, there, sums)
-
     def decode_bwd(self, commands: Commands, decoding: Decoding, arrays: FieldArrays, gradients: FieldArrays) -> None:
         """Record the backward pass, from the outputs, which have become their gradient.
 
@@ -126,17 +98,36 @@ class GridFieldPasses:
         self._encode_bwd(commands, decoding.points, encodings, gradients.tables)
         self.weights.heads_bwd(commands, arrays.weights, d_weights, d_heads, f"decoded {number}", decoding.time)
 
-    def compare_bwd(
-        self, commands: Commands, comparison: Comparison, gradients: FieldArrays, weights: list[float]
-    ) -> None:
-        """Record the backward pass of differences. weights: of the sum of each group."""
-        count = comparison.points[0].count
-        kernel = Kernel.get(self._device, "smoothness_bwd")
-        for here, there, weight in zip(comparison.here, comparison.there, weights, strict=False):
-            uniform = self._smoothness(here.shape[1], count, 2 * weight)
-            commands.dispatch(kernel, -(-here.size // 64), smoothness=uniform, here=here, there=there)
-        for points, encodings in zip(comparison.points, (comparison.here, comparison.there), strict=True):
-            self._encode_bwd(commands, points, encodings, gradients.tables)
+    def compare(
+        self,
+        commands: Commands,
+        number: int,
+        arrays: FieldArrays,
+        gradients: FieldArrays,
+        near: Sampling,
+        times: tuple[Time, Time],
+        weights: Sequence[float],
+    ) -> list[DeviceArray]:
+        """Record the squared differences (count,) between the features of samples at a time and of places near them at
+        another time, for each group of grids; and the gradient of their weighted sums.
+
+        number: as for `decode`; the next one is taken, too. times: give both. weights: of the sum of each group.
+        """
+        means = self._points(commands, number, lambda: replace(near(), reach=0.0), arrays, times[0])
+        places = self._points(commands, number + 1, near, arrays, times[1])
+        here, there = (self._encode(commands, points, arrays.tables) for points in (means, places))
+        forth, back = Kernel.get(self._device, "smoothness"), Kernel.get(self._device, "smoothness_bwd")
+        sums = []
+        for group, (a, b, weight) in enumerate(zip(here, there, weights, strict=False)):
+            (count, features), total = a.shape, self._pool.array(f"differences {group}", (means.count,))
+            content = forth.uniform("Smoothness", pairs=count, features=features, scale=2 * weight)
+            both = {"smoothness": self._pool.constant(content), "here": a, "there": b}
+            commands.dispatch(forth, -(-count // 64), sums=total, **both)
+            commands.dispatch(back, -(-a.size // 64), **both)
+            sums.append(total)
+        for points, d_encodings in ((means, here), (places, there)):
+            self._encode_bwd(commands, points, d_encodings, gradients.tables)
+        return sums
 
     def _points(
         self, commands: Commands, number: int, sampling: Sampling | None, arrays: FieldArrays, t: Time
@@ -157,7 +148,3 @@ class GridFieldPasses:
     ) -> None:
         for encoder, d_encoding in zip(self._encoders, d_encodings, strict=True):
             encoder.add_gradient(commands, points, d_encoding, d_tables)
-
-    def _smoothness(self, features: int, pairs: int, scale: float) -> DeviceArray:
-        kernel = Kernel.get(self._device, "smoothness")
-        return self._pool.constant(kernel.uniform("Smoothness", pairs=pairs, features=features, scale=scale))
