@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -15,6 +14,7 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.checkpoint import write_checkpoint
 from lapgs_wgpu.io.ply import GaussianSnapshot
+from lapgs_wgpu.io.regular_file import PathLike
 from lapgs_wgpu.motion.fields.config import MIN_SCALE, FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation, Deformed, Field, Nearby, TimeSamples
 from lapgs_wgpu.motion.fields.grid_field import GridField
@@ -277,7 +277,7 @@ class Scene4D:
         means, log_scales, quats = (each.numpy(force=True) for each in (now.means, now.scales.log(), now.quats))
         return GaussianSnapshot(means, sh.numpy(force=True), logits.numpy(force=True), log_scales, quats)
 
-    def save(self, path: str | os.PathLike[str], metadata: Mapping[str, str] | None = None) -> None:
+    def save(self, path: PathLike, metadata: Mapping[str, str] | None = None) -> None:
         """Write the scene to one file, which 3DGS viewers open as a static scene at time 0 (docs/format.md). Atomic.
 
         Args:
@@ -295,7 +295,7 @@ class Scene4D:
         write_checkpoint(path, arrays, tensors, {**self.metadata, **(metadata or {}), **header})
 
 
-def load(path: str | os.PathLike[str], device: Device | None = None, *, field: nn.Module | None = None) -> Scene4D:
+def load(path: PathLike, device: Device | None = None, *, field: nn.Module | None = None) -> Scene4D:
     """Read a checkpoint, or any 3DGS .ply file as a static scene.
 
     Args:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +16,7 @@ from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.io.dataclass_table import build_dataclass
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.io.lapgs_file import lapgs_bytes, pack_lapgs, unpack_lapgs
+from lapgs_wgpu.io.regular_file import PathLike
 from lapgs_wgpu.io.safe_json_toml import parse_json
 from lapgs_wgpu.motion.compact_scene import compress, expand, tensor_of
 from lapgs_wgpu.motion.fields.config import FieldConfig
@@ -44,7 +44,7 @@ class SceneFile:
     capture.
     """
 
-    path: str | os.PathLike[str]
+    path: PathLike
     field_config: FieldConfig
     sh_degree: int
     gaussians: dict[str, NDArray[np.float32]]
@@ -54,7 +54,7 @@ class SceneFile:
     timing: Timing = EVEN
 
 
-def read_scene(path: str | os.PathLike[str]) -> SceneFile:
+def read_scene(path: PathLike) -> SceneFile:
     """Read a checkpoint, a compact scene, or any 3DGS .ply file as a static scene. Raises InputError."""
     if (data := lapgs_bytes(path)) is not None:
         return read_compact(data, path)
@@ -77,7 +77,7 @@ def read_scene(path: str | os.PathLike[str]) -> SceneFile:
     return SceneFile(path, gaussians=gaussians, field=field, **header)
 
 
-def read_compact(data: bytes, path: str | os.PathLike[str]) -> SceneFile:
+def read_compact(data: bytes, path: PathLike) -> SceneFile:
     """As `read_scene`, of the bytes of a compact scene. path: where they are from."""
     tensors, metadata = unpack_lapgs(data, str(path))
     header = _read_header(metadata, path)
@@ -122,7 +122,7 @@ def row_shapes(config: FieldConfig) -> dict[str, tuple[int, ...]]:
     return _SHAPES | ({"dynamics": (size,)} if size else {})
 
 
-def _read_header(metadata: Mapping[str, str], path: str | os.PathLike[str]) -> dict[str, Any]:
+def _read_header(metadata: Mapping[str, str], path: PathLike) -> dict[str, Any]:
     """Return the attributes of a SceneFile that its texts hold, and the others of these."""
     others = dict(metadata)
     try:
@@ -145,7 +145,7 @@ def _read_header(metadata: Mapping[str, str], path: str | os.PathLike[str]) -> d
 
 
 def _float32(
-    tensors: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, ...], path: str | os.PathLike[str]
+    tensors: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, ...], path: PathLike
 ) -> NDArray[np.float32]:
     array = tensor_of(tensors, name, shape, str(path))
     values = array.astype(np.float32, copy=False)

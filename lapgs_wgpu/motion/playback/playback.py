@@ -85,8 +85,7 @@ class DevicePlayback:
         return self._field.static_features() if self._field else None
 
     def snapshot(self, t: float) -> GaussianSnapshot:
-        now = self.at(t)
-        means, quats, scales, opacities, colors = read_all([now.means, now.quats, now.scales, now.opacities, now.sh])
+        means, quats, scales, opacities, colors = read_all(list(self.at(t).arrays().values()))
         logits = self._file.gaussians["opacity_logits"]
         if self._file.field_config.appearance_size == 4:
             logits = opacity_logits(opacities)
