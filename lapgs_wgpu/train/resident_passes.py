@@ -14,7 +14,8 @@ from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.gpu.recording import Recording
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.passes.activation_passes import ActivationPasses, Line
-from lapgs_wgpu.motion.passes.grid_field_passes import Decoding, GridFieldPasses
+from lapgs_wgpu.motion.passes.decoder_passes import Decoding
+from lapgs_wgpu.motion.passes.grid_field_passes import GridFieldPasses
 from lapgs_wgpu.motion.passes.samples import Samples
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.drawing import Drawing, GaussianGradients

@@ -112,8 +112,8 @@ class GridField(Field):
         """
         size = self.config.dynamics_size
         if len(self.hidden):
-            identity, moved = torch.eye(self.config.width), self.config.width
-            heads = torch.cat([identity] if self.appearance is None else [identity, identity])
+            moved = self.config.width
+            heads = torch.eye(moved).repeat(1 if self.appearance is None else 2, 1)
             bias = heads.new_zeros(len(heads))
         else:
             layers = [self.heads] if self.appearance is None else [self.heads, self.appearance]

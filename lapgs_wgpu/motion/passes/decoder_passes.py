@@ -19,6 +19,8 @@ from lapgs_wgpu.gpu.matmul import Matmul, Matrix
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.config import APPEARANCE_SCALE, GEOMETRY, FieldConfig, static_grid, temporal_grids
 from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
+from lapgs_wgpu.motion.passes.hash_encoder_passes import PointSet
+from lapgs_wgpu.motion.passes.samples import Sampling
 
 _BLOCK = 1 << 14  # Gaussians per block: its layers and features take 80 MB at a width of 256
 ALIGNED = 64  # floats; a multiple of 256 bytes, at which a binding may begin
@@ -47,6 +49,24 @@ class Heads(NamedTuple):
 
     weights: DeviceArray
     biases: DeviceArray
+
+
+class Decoding(NamedTuple):
+    """Gaussians at a time that were decoded.
+
+    time: gives that of the field, in [0, 1]. sampling: gives those of the Gaussians; None for all, in their order.
+    points: of the encoder. inputs: of the decoder, by name: beside (count, D + 1) dynamics attributes, then ones;
+    static and temporal (count, features), the latter where there is any; in the backward pass these two become their
+    gradients. heads: at that time. outputs: (count, outputs) of the heads, without their biases; before the backward
+    pass they become their gradient.
+    """
+
+    time: Time
+    sampling: Sampling | None
+    points: PointSet
+    inputs: dict[str, DeviceArray]
+    heads: Heads
+    outputs: DeviceArray
 
 
 class FieldWeights:
@@ -81,42 +101,43 @@ class FieldWeights:
         weights = DeviceArray(buffer, (self.outputs, self.placed))
         return Heads(weights, DeviceArray(buffer, (_BIASES,), offset=4 * first))
 
-    def heads_at(self, commands: Commands, weights: DeviceArray, name: str, t: Time) -> Heads:
-        """Record the heads at a time. name: distinguishes the times that are submitted together."""
-        arrays = {"spectrum": self._spectrum(name, t), "weights": weights, "series": self._series(name)}
+    def heads_at(self, commands: Commands, weights: DeviceArray, number: int, t: Time) -> Heads:
+        """Record the heads at a time. number: distinguishes the times that are submitted together."""
+        arrays = {"spectrum": self._spectrum(number, t), "weights": weights, "series": self._series(number)}
         if self.motion:
             commands.dispatch(Kernel.get(self._device, "spectrum"), -(-self.width // 64), **arrays)
-        heads = self.heads(name)
+        heads = self.heads(f"at {number}")
         arrays |= {"heads": heads.weights, "biases": heads.biases}
         groups = -(-self.outputs * (self.placed + 1) // 64)
         commands.run(Kernel.get(self._device, "fold_motion", MOTION=self.motion), groups, arrays)
         return heads
 
     def heads_bwd(
-        self, commands: Commands, weights: DeviceArray, d_weights: DeviceArray, d_heads: Heads, name: str, t: Time
+        self, commands: Commands, weights: DeviceArray, d_weights: DeviceArray, d_heads: Heads, decoding: Decoding
     ) -> None:
-        """Record that the gradients of heads that `heads_at` gave are added to those of the weights."""
-        arrays = {"spectrum": self._spectrum(name, t), "weights": weights, "d_weights": d_weights}
-        arrays |= {"series": self._series(name), "d_series": self._series("gradient")}
+        """Record that the gradients of a decoding's heads are added to those of the weights."""
+        number = decoding.points.number
+        arrays = {"spectrum": self._spectrum(number, decoding.time), "weights": weights, "d_weights": d_weights}
+        arrays |= {"series": self._series(number), "d_series": self._series("gradient")}
         arrays |= {"d_heads": d_heads.weights, "d_biases": d_heads.biases}
         fold = Kernel.get(self._device, "fold_motion_bwd", MOTION=self.motion)
         commands.run(fold, self.width, arrays)
         if self.motion:
             commands.run(Kernel.get(self._device, "spectrum_bwd"), self.config.components, arrays)
 
-    def _series(self, name: str) -> DeviceArray:
+    def _series(self, name: object) -> DeviceArray:
         return self._pool.array(f"series {name}", (self.width,))
 
-    def _spectrum(self, name: str, t: Time) -> DeviceArray:
-        """Return the uniform of the spectrum at a time, with the places of what is folded into the heads."""
+    def _spectrum(self, number: int, t: Time) -> DeviceArray:
         kernel = Kernel.get(self._device, "spectrum")
         names = {key: f"motion.{key}" for key in ("alpha", "beta", "frequencies")}
         names |= {"second": "motion.second.weight", "second_bias": "motion.second.bias"}
         names |= {"heads": "heads.weight", "head_biases": "heads.bias"}
-        given = {key: self.places[of].first if of in self.places else 0 for key, of in names.items()}
+        absent = Segment(0, ())
+        given: dict[str, float] = {key: self.places.get(name, absent).first for key, name in names.items()}
         given |= {"width": self.width, "components": self.config.components, "columns": self.placed}
-        factors = {"outputs": self.outputs, "unit": self.config.unit, "appearance": APPEARANCE_SCALE}
-        return self._pool.varying(f"spectrum {name}", lambda: kernel.uniform("Spectrum", time=t(), **factors, **given))
+        given |= {"outputs": self.outputs, "unit": self.config.unit, "appearance": APPEARANCE_SCALE}
+        return self._pool.varying(f"spectrum {number}", lambda: kernel.uniform("Spectrum", time=t(), **given))
 
 
 class _Product(NamedTuple):
@@ -141,11 +162,7 @@ class _Product(NamedTuple):
 
 
 class DecoderPasses:
-    """Records the passes on one device, a block of Gaussians after another.
-
-    inputs, in the calls: by name, beside (N, D + 1) dynamics attributes, then ones; static and temporal (N, features),
-    the latter where there is any. weights: the array of `FieldWeights`.
-    """
+    """Records the passes on one device, a block of Gaussians after another. weights: the array of `FieldWeights`."""
 
     def __init__(self, device: Device, layers: FieldWeights) -> None:
         self._device, self._of, self._pool = device, layers, BufferPool(device)
@@ -160,41 +177,32 @@ class DecoderPasses:
         ]
         self._products = [each for each in products if each.columns]
 
-    def decode(
-        self,
-        commands: Commands,
-        inputs: Mapping[str, DeviceArray],
-        weights: DeviceArray,
-        heads: Heads,
-        outputs: DeviceArray,
-    ) -> None:
-        """Record the forward pass. outputs: (N, outputs) float32, without the heads' biases."""
-        for first, count in self._blocks(outputs):
-            _, features = self._activate(commands, first, count, inputs, weights)
-            target = Matrix.of(outputs.rows(first, count))
-            self._product(commands, features, Matrix.of(heads.weights).transpose, target)
+    def decode(self, commands: Commands, weights: DeviceArray, decoding: Decoding) -> None:
+        """Record the forward pass, which writes the outputs."""
+        for first, count in self._blocks(decoding):
+            _, features = self._activate(commands, first, count, decoding.inputs, weights)
+            target = Matrix.of(decoding.outputs.rows(first, count))
+            self._product(commands, features, Matrix.of(decoding.heads.weights).transpose, target)
 
     def decode_bwd(
         self,
         commands: Commands,
-        inputs: Mapping[str, DeviceArray],
         weights: DeviceArray,
-        heads: Heads,
-        d_outputs: DeviceArray,
-        d_inputs: Mapping[str, DeviceArray],
+        decoding: Decoding,
+        d_beside: DeviceArray,
         d_weights: DeviceArray,
-        d_heads: Heads,
     ) -> None:
-        """Record the backward pass: d_inputs, which may be the inputs' own arrays, and d_heads are written, d_weights
-        added to."""
+        """Record the backward pass: d_beside is written, d_weights added to."""
+        inputs, d_inputs = decoding.inputs, decoding.inputs | {"beside": d_beside}
         split, of = self._product.split_k, self._of
-        for first, count in self._blocks(d_outputs):
+        d_heads = of.heads("gradient")
+        for first, count in self._blocks(decoding):
             layers, features = self._activate(commands, first, count, inputs, weights)
-            d, more = Matrix.of(d_outputs.rows(first, count)), first > 0
+            d, more = Matrix.of(decoding.outputs.rows(first, count)), first > 0
             ones = Matrix.of(inputs["beside"].rows(first, count)).from_column(of.dynamics, 1)
             split(commands, d.transpose, features, Matrix.of(d_heads.weights), add=more)
             split(commands, d.transpose, ones, Matrix(d_heads.biases, of.outputs, 1, 1), add=more)
-            self._product(commands, d, Matrix.of(heads.weights), features)
+            self._product(commands, d, Matrix.of(decoding.heads.weights), features)
             self._gate("gate_bwd", commands, count, weights, d_features=features.array, layers=layers.array)
             d_biases = Matrix(d_weights, of.channels, 1, 1, of.places["spatial.bias"].first)
             split(commands, layers.transpose, ones, d_biases, add=True)
@@ -202,10 +210,11 @@ class DecoderPasses:
                 own, given = layers.from_column(each.channel, each.channels), each.given(inputs, first, count)
                 split(commands, own.transpose, given, each.weights(d_weights), add=True)
                 self._product(commands, own, each.weights(weights), each.given(d_inputs, first, count))
+        of.heads_bwd(commands, weights, d_weights, d_heads, decoding)
 
-    def _blocks(self, outputs: DeviceArray) -> list[tuple[int, int]]:
+    def _blocks(self, decoding: Decoding) -> list[tuple[int, int]]:
         """First Gaussian and number of Gaussians of each block."""
-        n = outputs.shape[0]
+        n = decoding.points.count
         return [(first, min(self._block, n - first)) for first in range(0, n, self._block)]
 
     def _activate(

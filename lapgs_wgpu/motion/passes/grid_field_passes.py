@@ -14,7 +14,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.config import FieldConfig, static_grid, temporal_grids
-from lapgs_wgpu.motion.passes.decoder_passes import DecoderPasses, FieldWeights, Heads, Time
+from lapgs_wgpu.motion.passes.decoder_passes import DecoderPasses, Decoding, FieldWeights, Time
 from lapgs_wgpu.motion.passes.hash_encoder_passes import HashEncoderPasses, PointSet
 from lapgs_wgpu.motion.passes.samples import SamplePasses, Sampling
 
@@ -30,22 +30,6 @@ class FieldArrays(NamedTuple):
     beside: DeviceArray
     tables: list[DeviceArray]
     weights: DeviceArray
-
-
-class Decoding(NamedTuple):
-    """Gaussians at a time that were decoded.
-
-    time: gives that of the field, in [0, 1]. sampling: gives those of the Gaussians; None for all, in their order.
-    points, inputs: of encoder and decoder. heads: at that time. outputs: (count, outputs) of the heads, without their
-    biases; before `backward` they become their gradient.
-    """
-
-    time: Time
-    sampling: Sampling | None
-    points: PointSet
-    inputs: dict[str, DeviceArray]
-    heads: Heads
-    outputs: DeviceArray
 
 
 class GridFieldPasses:
@@ -75,28 +59,27 @@ class GridFieldPasses:
         if sampling is not None:
             beside = self._pool.array(f"beside {number}", (points.count, beside.shape[1]))
             self._samples.rows(commands, f"set {number}", sampling, arrays.beside, beside, back=False)
-        heads = self.weights.heads_at(commands, arrays.weights, f"decoded {number}", t)
+        heads = self.weights.heads_at(commands, arrays.weights, number, t)
         inputs = dict(zip(("beside", "static", "temporal"), [beside, *encodings], strict=False))
         outputs = self._pool.array(f"outputs {number}", (points.count, self.weights.outputs))
-        self._decoder.decode(commands, inputs, arrays.weights, heads, outputs)
-        return Decoding(t, sampling, points, inputs, heads, outputs)
+        decoding = Decoding(t, sampling, points, inputs, heads, outputs)
+        self._decoder.decode(commands, arrays.weights, decoding)
+        return decoding
 
     def decode_bwd(self, commands: Commands, decoding: Decoding, arrays: FieldArrays, gradients: FieldArrays) -> None:
         """Record the backward pass, from the outputs, which have become their gradient.
 
         The gradient of `beside` is written for all Gaussians, and added for samples.
         """
-        d_beside, d_heads, number = gradients.beside, self.weights.heads("gradient"), decoding.points.number
+        d_beside = gradients.beside
         if decoding.sampling is not None:
             d_beside = self._pool.array("d_beside", decoding.inputs["beside"].shape)
-        inputs, d_weights = decoding.inputs, gradients.weights
-        given = inputs, arrays.weights, decoding.heads, decoding.outputs
-        self._decoder.decode_bwd(commands, *given, inputs | {"beside": d_beside}, d_weights, d_heads)
+        self._decoder.decode_bwd(commands, arrays.weights, decoding, d_beside, gradients.weights)
         if decoding.sampling is not None:
+            number = decoding.points.number
             self._samples.rows(commands, f"set {number}", decoding.sampling, gradients.beside, d_beside, back=True)
-        encodings = [array for name, array in inputs.items() if name != "beside"]
+        encodings = [array for name, array in decoding.inputs.items() if name != "beside"]
         self._encode_bwd(commands, decoding.points, encodings, gradients.tables)
-        self.weights.heads_bwd(commands, arrays.weights, d_weights, d_heads, f"decoded {number}", decoding.time)
 
     def compare(
         self,
