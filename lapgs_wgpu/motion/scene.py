@@ -88,11 +88,8 @@ class Scene4D:
     ) -> None:
         """Make a scene of Gaussians and a field that is new. Raises InputError where own_field does not fit the kind.
 
-        Args:
-            parameters: as the attribute; copied.
-            field_config: as the attribute, as are device, sh_degree and antialiased.
-            seed: of the field's initial parameters.
-            own_field: a module in place of the configured field (docs/api.md).
+        parameters: as the attribute; copied. seed: of the field's initial parameters. own_field: a module in place of
+        the configured field (docs/api.md). The others are as the attributes.
         """
         check_own(field_config, own_field)
         self.on_access: Callable[[str], None] = lambda part: None
@@ -124,16 +121,9 @@ class Scene4D:
     ) -> Scene4D:
         """A scene of isotropic Gaussians.
 
-        Args:
-            points: (N, 3) means, world units.
-            colors: (N, 3) in [0, 1].
-            scales: (N,) standard deviations, world units.
-            field_config: as for `Scene4D`.
-            opacity: of all Gaussians, in (0, 1).
-            antialiased: as for `Scene4D`.
-            device: None for the default adapter.
-            seed: as for `Scene4D`.
-            own_field: as for `Scene4D`.
+        points: (N, 3) means, world units. colors: (N, 3) in [0, 1]. scales: (N,) standard deviations, world units.
+        opacity: of all Gaussians, in (0, 1). device: None for the default adapter. field_config, antialiased, seed and
+        own_field are as for `Scene4D`.
         """
         parameters = isotropic_rows(points, colors, scales, opacity)
         parameters["dynamics"] = torch.zeros(len(points), field_config.dynamics_size)
@@ -193,13 +183,10 @@ class Scene4D:
         *,
         timing: Timing | None = None,
     ) -> Deformed:
-        """The Gaussians at time t, with what the losses of motion compare; differentiable as those of `at`.
+        """The Gaussians at time t, with what the losses of motion compare; t, timing and derivatives are those of `at`.
 
-        Args:
-            t: time in [0, 1].
-            nearby: where the smoothness loss looks; None without it.
-            time_samples: some of the Gaussians and further times of the field.
-            timing: takes the place of the scene's; None for the scene's.
+        nearby: where the smoothness loss looks; None without it. time_samples: some of the Gaussians and further times
+        of the field.
         """
         t = (timing or self.timing)(t)
         if self.on_device is not None and not torch.is_grad_enabled() and nearby is None and time_samples is None:
