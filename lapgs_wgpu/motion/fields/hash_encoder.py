@@ -7,9 +7,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from lapgs_wgpu.gpu.array import DeviceArray, read_all
@@ -60,23 +58,23 @@ class HashEncoder:
         """Return the encodings by place, then by group, without autograd."""
         tables, sets = self._tables(), self._sets(places)
         for array, grid in zip(tables, self.grids, strict=True):
-            array.write(_host(grid.table))
+            array.write(grid.table.numpy(force=True))
         with Commands(self._device) as commands:
             for passes, points, encoding in sets:
                 passes.encode(commands, points, tables, encoding)
-        return _read([encoding for _, _, encoding in sets], places)
+        return [torch.from_numpy(found) for found in read_all([encoding for _, _, encoding in sets])]
 
     def backward(self, places: Sequence[Place], d_encodings: Sequence[Tensor]) -> list[Tensor]:
         """Return the gradients of the tables from those of the encodings, in the order of `encode`."""
         d_tables, sets = self._tables(), self._sets(places)
         for (_, _, array), values in zip(sets, d_encodings, strict=True):
-            array.write(_host(values))
+            array.write(values.numpy(force=True))
         with Commands(self._device) as commands:
             for table in d_tables:
                 commands.clear(table)
             for passes, points, d_encoding in sets:
                 passes.add_gradient(commands, points, d_encoding, d_tables)
-        return _read(d_tables, places)
+        return [torch.from_numpy(found) for found in read_all(d_tables)]
 
     def _tables(self) -> list[DeviceArray]:
         """Arrays for the tables of all grids, or for their gradients."""
@@ -90,21 +88,12 @@ class HashEncoder:
         """
         sets = []
         for number, (points, time) in enumerate(places):
-            padded = self._pool.upload(f"points {number}", _host(nn.functional.pad(points.detach().float(), (0, 1))))
-            uploaded = PointSet(number, padded, len(points), partial(float, time))
+            array = self._pool.upload(f"points {number}", nn.functional.pad(points.float(), (0, 1)).numpy())
+            uploaded = PointSet(number, array, len(points), partial(float, time))
             for group, passes in enumerate(self._passes):
                 encoding = self._pool.array(f"encoding {number} {group}", (len(points), passes.features))
                 sets.append((passes, uploaded, encoding))
         return sets
-
-
-def _read(arrays: Sequence[DeviceArray], places: Sequence[Place]) -> list[Tensor]:
-    """The content of arrays, as tensors where the points are."""
-    return [torch.from_numpy(array).to(places[0][0].device) for array in read_all(arrays)]
-
-
-def _host(tensor: Tensor) -> NDArray[np.float32]:
-    return tensor.detach().to("cpu", torch.float32).contiguous().numpy()
 
 
 class _Encode(torch.autograd.Function):

@@ -41,15 +41,14 @@ class OwnField(Field):
         if not isinstance(module, nn.Module):
             raise InputError(f"a field must be an nn.Module, such as field=Drift() for a class Drift; got {module!r}.")
         self.module, self._name = module, type(module).__name__
-        named = inspect.signature(module.forward).parameters
-        self._takes = [name for name in ("dynamics", "nearby") if name in named]
+        self._takes = inspect.signature(module.forward).parameters
 
     def forward(
         self, means: Tensor, t: float, dynamics: Tensor | None = None, nearby: Nearby | None = None
     ) -> Deformation:
         """See motion/fields/deformation.py. Raises InputError for results of another form."""
         beside = {"dynamics": dynamics, "nearby": nearby}
-        move = self.module(means, t, **{name: beside[name] for name in self._takes})
+        move = self.module(means, t, **{name: value for name, value in beside.items() if name in self._takes})
         if isinstance(move, Tensor):
             move = Deformation(translation=move)
         if not isinstance(move, Deformation):
