@@ -208,7 +208,7 @@ class ResidentPasses:
         if self._task.near is not None:
             weights = [weight / self._task.near.count for weight in (smooth.static, smooth.temporal)]
             near, times = self._of_task("near"), (decoding.time, self._of_task("near_time"))
-            differences = field.compare(commands, 1, values, gradients, near, times, weights)
+            differences = field.compare(commands, values, gradients, near, times, weights)
             for total, sums, weight in zip(TOTALS, differences, weights, strict=False):
                 self._total(commands, sums, total, weight, totals)
         if self.dynamics_loss:

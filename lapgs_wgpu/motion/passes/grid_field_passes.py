@@ -51,7 +51,7 @@ class GridFieldPasses:
     ) -> Decoding:
         """Record the forward pass of all Gaussians, or of samples, at a time of the field.
 
-        number: distinguishes the times that are submitted together, from 0 on.
+        number: distinguishes the times that are submitted together; 1 and 2 are those that `compare` takes.
         """
         points = self._points(commands, number, sampling, arrays, t)
         encodings = self._encode(commands, points, arrays.tables)
@@ -84,7 +84,6 @@ class GridFieldPasses:
     def compare(
         self,
         commands: Commands,
-        number: int,
         arrays: FieldArrays,
         gradients: FieldArrays,
         near: Sampling,
@@ -94,10 +93,10 @@ class GridFieldPasses:
         """Record the squared differences (count,) between the features of samples at a time and of places near them at
         another time, for each group of grids; and the gradient of their weighted sums.
 
-        number: as for `decode`; the next one is taken, too. times: give both. weights: of the sum of each group.
+        times: give both. weights: of the sum of each group.
         """
-        means = self._points(commands, number, lambda: replace(near(), reach=0.0), arrays, times[0])
-        places = self._points(commands, number + 1, near, arrays, times[1])
+        means = self._points(commands, 1, lambda: replace(near(), reach=0.0), arrays, times[0])
+        places = self._points(commands, 2, near, arrays, times[1])
         here, there = (self._encode(commands, points, arrays.tables) for points in (means, places))
         forth, back = Kernel.get(self._device, "smoothness"), Kernel.get(self._device, "smoothness_bwd")
         sums = []

@@ -46,8 +46,8 @@ class Playback(Protocol):
 def playback_of(file: SceneFile, device: Device) -> Playback:
     """Playback of a file that was read.
 
-    torch is imported only for fields that do not `decodes_on_device`. Raises MemoryError if a buffer of all Gaussians
-    exceeds the device's limits: that of colors, 1.4 million Gaussians of degree 3 at WebGPU's default limits.
+    Raises MemoryError if a buffer of all Gaussians exceeds the device's limits. The colors are the largest one: 1.4
+    million Gaussians of degree 3 at WebGPU's default limits.
     """
     if file.field_config.kind == "static" or file.field_config.decodes_on_device:
         return DevicePlayback(file, device)
