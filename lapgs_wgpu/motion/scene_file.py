@@ -23,7 +23,6 @@ from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
 from lapgs_wgpu.motion.timing import EVEN, Timing, timing_of_text
 
-_MAX_DEGREE = 3
 _SHAPES = {
     "means": (3,),
     "log_scales": (3,),
@@ -128,8 +127,8 @@ def _read_header(metadata: Mapping[str, str], path: PathLike) -> dict[str, Any]:
     try:
         config = build_dataclass(FieldConfig, parse_json(others.pop("field"), "its text"), "field")
         degree = int(others.pop("sh_degree"))
-        if not 0 <= degree <= _MAX_DEGREE:
-            raise ValueError(f"sh_degree {degree} is outside 0 to {_MAX_DEGREE}")
+        if not 0 <= degree <= 3:
+            raise ValueError(f"sh_degree {degree} is outside 0 to 3")
         antialiased = others.pop("antialiased", "false")  # older files lack it
         if antialiased not in ("false", "true"):
             raise ValueError(f"antialiased {antialiased!r} is neither true nor false")
