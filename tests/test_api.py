@@ -239,8 +239,8 @@ class Rows(nn.Module):
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        (lambda n: torch.zeros(n, 4), r"Rows returned translation \(300, 4\), not \(300, 3\)"),
-        (lambda n: Deformation(orientation=torch.zeros(n, 3)), r"orientation \(300, 3\), not \(300, 4\)"),
+        (lambda n: torch.zeros(n, 4), r"Rows must return translation as a Tensor \(300, 3\), got \(300, 4\)"),
+        (lambda n: Deformation(orientation=torch.zeros(n, 3)), r"orientation as a Tensor \(300, 4\), got \(300, 3\)"),
         (lambda n: None, "must return a Tensor or a Deformation, got NoneType"),
     ],
 )
@@ -306,7 +306,7 @@ def test_a_field_can_move_the_scene_rigidly(dataset: Dataset, device: Device) ->
 
 
 def test_a_class_in_place_of_a_module_is_refused() -> None:
-    with pytest.raises(InputError, match=r"must be an nn.Module, such as field=Drift\(\) .* got the class Drift"):
+    with pytest.raises(InputError, match=r"must be an nn.Module, such as field=Drift\(\) .* got <class .*Drift"):
         OwnField(Drift)  # type: ignore[arg-type]
 
 

@@ -75,6 +75,7 @@ def test_smoothness(device: Device) -> None:
         (FieldConfig(kind="grid4d", motion="mlp"), True),
         (FieldConfig(depth=1), False),
         (FieldConfig(motion="mlp"), False),
+        (FieldConfig(width=4096), False),
         (FieldConfig(kind="hexplane"), False),
         (FieldConfig(kind="static"), False),
     ],

@@ -11,14 +11,13 @@ from helpers.encoder_reference import encode_reference
 from helpers.fields import COUNT, DYNAMICS, NEARBY, OURS, POINTS, ROWS, grid_field, made, parts, stirred
 
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.fields import grid_field as grid_field_module
 from lapgs_wgpu.motion.fields.config import FieldConfig, FieldKind
 from lapgs_wgpu.motion.fields.deformation import Deformation
 from lapgs_wgpu.motion.fields.hexplane_field import HexPlaneField
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion, TimeMotion
-from lapgs_wgpu.motion.fields.make_field import make_field
 from lapgs_wgpu.motion.fields.mlp_field import MlpField, octaves
 from lapgs_wgpu.motion.fields.parameter_shapes import PLANES
+from lapgs_wgpu.motion.scene import make_field
 
 KINDS: tuple[FieldKind, ...] = ("mlp", "hexplane", "grid4d", "laplacian")
 
@@ -125,30 +124,6 @@ def test_static_scenes_have_no_field(device: Device) -> None:
 
 def test_time_fills_a_share_of_its_axis() -> None:
     assert [OURS.grid_time(t) for t in (0.0, 0.5, 1.0)] == pytest.approx([0.05, 0.5, 0.95])
-
-
-@pytest.mark.parametrize("kind", ["grid4d", "laplacian"])
-def test_many_gaussians_pass_hidden_layers_in_blocks(
-    device: Device, kind: FieldKind, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The same values and gradients, and of the decoder's activations none is kept for the backward pass."""
-    field = grid_field(device, replace(OURS, kind=kind, depth=1, width=64))
-    d = DYNAMICS.clone().requires_grad_() if kind == "laplacian" else None
-    learnt = [*field.parameters(), *([] if d is None else [d])]
-    found, kept = [], []
-    for most in (COUNT, COUNT - 1):
-        monkeypatch.setattr(grid_field_module, "KEPT", most)
-        monkeypatch.setattr(grid_field_module, "_BLOCK", 16)
-        shapes: list[tuple[int, ...]] = []
-        with torch.autograd.graph.saved_tensors_hooks(lambda x, to=shapes: to.append(tuple(x.shape)) or x, lambda x: x):
-            move = field(POINTS, 0.3, d, NEARBY)
-        kept.append(sum(shape[0] in (16, 8, COUNT) and shape[1:] == (64,) for shape in shapes))
-        gradients = torch.autograd.grad(sum(part.square().sum() for part in parts(move)), learnt)
-        found.append([*(part.detach() for part in parts(move)), *gradients])
-    assert kept[0] > 0
-    assert kept[1] == 0
-    for whole, blocks in zip(*found, strict=True):
-        torch.testing.assert_close(blocks, whole, rtol=1e-4, atol=1e-5)
 
 
 def test_ablations_of_the_field(device: Device) -> None:

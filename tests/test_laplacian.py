@@ -40,7 +40,7 @@ def test_the_spectrum_at_the_start() -> None:
     )
     assert wide.frequencies.tolist() == [0.5 * k for k in range(25)]
     assert float(wide.series(0.3).detach().std()) == pytest.approx(0.3, rel=0.05)
-    amplitudes = wide.amplitudes()
+    amplitudes = (wide.alpha.square() + wide.beta.square()).mean(dim=1).sqrt().detach()
     for k in (2, 5, 24):
         assert float(amplitudes[1] / amplitudes[k]) == pytest.approx(k, rel=0.05)
 
@@ -63,7 +63,7 @@ def test_features_are_the_series_times_a_part_of_each_gaussian() -> None:
 
 
 def test_the_stand_in_is_an_mlp_of_features_and_time() -> None:
-    m, t = TimeMotion(INPUTS, WIDTH, torch.Generator().manual_seed(3)).double(), 0.6
+    m, t = TimeMotion(INPUTS, FieldConfig(width=WIDTH), torch.Generator().manual_seed(3)).double(), 0.6
     inner = torch.relu(m.first(torch.cat([STATIC, torch.full((len(STATIC), 1), t)], dim=1)))
     torch.testing.assert_close(features(m, t), m.second(inner))
 

@@ -51,11 +51,11 @@ def test_the_text_gives_the_same_bits() -> None:
     ("table", "reason"),
     [
         ([], "no table of times and moments"),
-        ({"times": [0.0, 1.0], "moments": [0.5]}, "2 times and 1 moments"),
-        ({"times": [0.5, 0.5], "moments": [0.5, 0.6]}, "timing.times do not ascend"),
-        ({"times": [0.5, 0.6], "moments": [0.6, 0.5]}, "timing.moments descend"),
-        ({"times": [0.5], "moments": [1.5]}, "timing.moments are not numbers between 0 and 1"),
-        ({"times": [float("nan")], "moments": [0.5]}, "timing.times are not numbers between 0 and 1"),
+        ({"times": [0.0, 1.0], "moments": [0.5]}, "as many numbers from 0 to 1"),
+        ({"times": [0.5, 0.5], "moments": [0.5, 0.6]}, "timing.times must be different"),
+        ({"times": [0.5, 0.6], "moments": [0.6, 0.5]}, "never descend"),
+        ({"times": [0.5], "moments": [1.5]}, "numbers from 0 to 1"),
+        ({"times": [float("nan")], "moments": [0.5]}, "numbers from 0 to 1"),
     ],
 )
 def test_text_that_is_no_timing_is_refused(table: object, reason: str) -> None:

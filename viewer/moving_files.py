@@ -117,10 +117,10 @@ def read_frames(files: list[Path], metadata: dict[str, str]) -> MovingFile:
         now = activate(file.gaussians, first.sh_degree)
         present = np.arange(max(counts)) < len(now["means"])
         rows = np.where(present, np.arange(max(counts)), 0)
-        names = ("means", "quats", "scales", "opacities", "colors")
-        means, quats, scales, opacities, colors = (now[name][rows] for name in names)
+        names = ("means", "quats", "scales", "opacities", "sh")
+        means, quats, scales, opacities, sh = (now[name][rows] for name in names)
         means += (_offset(file) - start).astype(np.float32)
-        return Gaussians(means, quats, scales, opacities * present, colors, antialiased=file.antialiased)
+        return Gaussians(means, quats, scales, opacities * present, sh, antialiased=file.antialiased)
 
     metadata = {name: text for name, text in first.metadata.items() if name == "up"} | metadata
     return MovingFile(lambda t: frame(round(t * (len(files) - 1))), len(files), metadata)

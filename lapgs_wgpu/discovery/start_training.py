@@ -9,7 +9,7 @@ from torch import nn
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.discovery.discover import discover
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.fields.make_field import check_own
+from lapgs_wgpu.motion.fields.own_field import check_own
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.host import step_threads, torch_threads
 from lapgs_wgpu.train.parts import Parts

@@ -16,27 +16,15 @@ from numpy.typing import NDArray
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.fields.config import MIN_SCALE, FieldConfig, static_grid, temporal_grids
-from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
+from lapgs_wgpu.motion.fields.parameter_shapes import Shapes, parameter_shapes
 from lapgs_wgpu.motion.quantize import Quantized, dequantize, quantize
 from lapgs_wgpu.splat.constants import CONSTANTS
 
 Floats = NDArray[np.float32]
 Arrays = dict[str, Floats]
 
-STATIC_TABLE = "static_grid.table"
-# Name of a Gaussian's values -> bits of each, and whether zero is exact. docs/results.md has what fewer bits cost.
-_BITS = {
-    "means": (16, False),
-    "log_scales": (8, False),
-    "quats": (8, True),
-    "opacity_logits": (8, False),
-    "sh_dc": (8, False),
-    "sh_rest": (5, True),
-    "dynamics": (6, True),
-    "static_features": (6, True),
-}
 _TABLE_BITS = 8
-_EXACT = ("motion.frequencies",)  # a phase is up to 2 pi times this: 16 bits would move the end of the clip
+_EXACT = "motion.frequencies"  # a phase is up to 2 pi times this: 16 bits would move the end of the clip
 _MOST_LOGIT = 16.0  # beyond it an opacity is 0 or 1 to seven digits
 # Largest errors of a value by what they change in a picture.
 _SHIFT = 0.03  # of a mean, standard deviations of the Gaussian
@@ -51,16 +39,24 @@ _PIXELS = 1000  # of the picture's height in which a pixel is meant
 _NEAREST = 0.25  # of the initial distance: what a viewer comes near to
 
 
-def row_columns(config: FieldConfig, sh_degree: int) -> dict[str, int]:
-    """Name of what a compact scene holds of each Gaussian -> number of values."""
-    columns = {"means": 3, "log_scales": 3, "quats": 4, "opacity_logits": 1, "sh_dc": 3}
-    if sh_degree:
-        columns["sh_rest"] = 3 * ((sh_degree + 1) ** 2 - 1)
-    if config.dynamics_size:
-        columns["dynamics"] = config.dynamics_size
-    if config.kind != "static":
-        columns["static_features"] = static_grid(config).features
-    return columns
+def _row_formats(config: FieldConfig, sh_degree: int) -> dict[str, tuple[int, int, bool]]:
+    """Return by name of what a scene holds of each Gaussian the number of values, the bits of each, and whether zero is
+    exact. docs/results.md has what fewer bits cost."""
+    formats = {
+        "means": (3, 16, False),
+        "log_scales": (3, 8, False),
+        "quats": (4, 8, True),
+        "opacity_logits": (1, 8, False),
+        "sh_dc": (3, 8, False),
+        "sh_rest": (3 * ((sh_degree + 1) ** 2 - 1), 5, True),
+        "dynamics": (config.dynamics_size, 6, True),
+        "static_features": (static_grid(config).features if config.kind != "static" else 0, 6, True),
+    }
+    return {name: row for name, row in formats.items() if row[0]}
+
+
+def _field_shapes(config: FieldConfig) -> Shapes:
+    return {name: shape for name, shape in parameter_shapes(config).items() if name != "static_grid.table"}
 
 
 def compress(
@@ -68,41 +64,37 @@ def compress(
     field: Mapping[str, Floats],
     config: FieldConfig,
     sh_degree: int,
-    look: InitialView | None = None,
-    *,
-    finer: float = 1.0,
+    look: InitialView | None,
+    finer: float,
 ) -> dict[str, NDArray[Any]]:
-    """Return the tensors of a compact scene.
+    """Return the tensors of a compact scene, without Gaussians that are too faint to be drawn at any time.
 
     gaussians: as SceneFile has them, and "static_features" (N, F) where the scene moves. field: as SceneFile has it.
-    look: from where and how near it is seen; by default, so near that only the Gaussians' own sizes count.
+    look: from where and how near it is seen; None: so near that only the Gaussians' own sizes count.
     finer: factor of the largest errors that are allowed.
-    Gaussians that are too faint to be drawn at any time are left out.
     """
-    stored = {name: gaussians[name] for name in _BITS if name in gaussians}
+    formats = _row_formats(config, sh_degree)
+    stored = {name: gaussians[name].reshape(len(gaussians["means"]), -1)[:, : formats[name][0]] for name in formats}
     stored["log_scales"] = np.maximum(stored["log_scales"], np.float32(math.log(MIN_SCALE)))
     stored["quats"] = stored["quats"] / np.maximum(np.linalg.norm(stored["quats"], axis=1, keepdims=True), 1e-12)
     stored["opacity_logits"] = stored["opacity_logits"].clip(-_MOST_LOGIT, _MOST_LOGIT)
-    stored["sh_rest"] = stored["sh_rest"][:, : (sh_degree + 1) ** 2 - 1]
-    held = held_rows(stored["opacity_logits"], config)
+    held = held_rows(gaussians["opacity_logits"], config)
     stored = {name: values[held] for name, values in stored.items()}
     allowed = _allowed_errors(stored, config.appearance_size == 4, look)
     tensors: dict[str, NDArray[Any]] = {}
-    for name, columns in row_columns(config, sh_degree).items():
-        bits, centered = _BITS[name]
-        values = stored[name].reshape(-1, columns)
+    for name, (_, bits, centered) in formats.items():
+        values = stored[name]
         most = allowed[name] if name in allowed else _half_step(values, bits)
         tensors |= _named(f"gaussians.{name}", quantize(values, bits, finer * most, centered=centered))
     starts = _table_starts(config)
-    for name, values in field.items():
-        if name == STATIC_TABLE:
-            continue
+    for name in _field_shapes(config):
+        values = field[name]
         if name.endswith(".table"):
             most = finer * _half_step(values, _TABLE_BITS, starts)
             tensors |= _named(f"field.{name}", quantize(values, _TABLE_BITS, most, centered=True, starts=starts))
         else:
             with np.errstate(over="ignore"):  # refused when it is written
-                tensors[f"field.{name}"] = values if name in _EXACT else values.astype(np.float16)
+                tensors[f"field.{name}"] = values if name == _EXACT else values.astype(np.float16)
     return tensors
 
 
@@ -124,13 +116,12 @@ def expand(
     """
     if config.kind != "static" and not config.decodes_on_device:
         raise InputError(f"{where}: its field {config.kind} is none that a compact scene can hold; the file is damaged")
-    reader = _Reader(tensors, where)
-    columns = row_columns(config, sh_degree)
     means = tensors.get("gaussians.means")
     count = means.shape[1] if means is not None and means.ndim == 2 else 0
     if not count:
         raise InputError(f"{where}: holds no Gaussians in its tensor 'gaussians.means'; the file is damaged")
-    gaussians = {name: reader.columns(f"gaussians.{name}", count, width) for name, width in columns.items()}
+    formats = _row_formats(config, sh_degree)
+    gaussians = {name: _columns(tensors, f"gaussians.{name}", (formats[name][0], count), where) for name in formats}
     rest = np.zeros((count, 15, 3), np.float32)
     if sh_degree:
         rest[:, : (sh_degree + 1) ** 2 - 1] = gaussians["sh_rest"].reshape(count, -1, 3)
@@ -139,13 +130,12 @@ def expand(
     gaussians["opacity_logits"] = gaussians["opacity_logits"].reshape(count)
     field: Arrays = {}
     starts = _table_starts(config)
-    for name, shape in parameter_shapes(config).items():
+    for name, shape in _field_shapes(config).items():
         if name.endswith(".table"):
-            if name != STATIC_TABLE:
-                field[name] = reader.columns(f"field.{name}", shape[0], shape[1], starts)
+            field[name] = _columns(tensors, f"field.{name}", shape[::-1], where, starts)
         else:
-            code = "f4" if name in _EXACT else "f2"
-            field[name] = reader.tensor(f"field.{name}", shape, code).astype(np.float32)
+            code = "f4" if name == _EXACT else "f2"
+            field[name] = tensor_of(tensors, f"field.{name}", shape, where, code).astype(np.float32)
     return gaussians, field
 
 
@@ -157,9 +147,9 @@ def _allowed_errors(
     pixel = _pixels(means, look)[:, None]
     shift = np.maximum(_SHIFT * np.sort(scales, axis=1)[:, 1:2], _SHIFT_PIXELS * pixel)
     ratio = CONSTANTS["DILATION"] * (pixel / scales) ** 2
-    opacity = 0.5 + 0.5 * np.tanh(0.5 * stored["opacity_logits"].astype(np.float64)[:, None])
+    opacity = 0.5 + 0.5 * np.tanh(0.5 * stored["opacity_logits"].astype(np.float64))
     logit = _OPACITY / (np.maximum(opacity, _FAINT) * (1 - opacity + 1e-9))
-    color = np.abs(0.5 + CONSTANTS["SH_C0"] * stored["sh_dc"].reshape(-1, 3).astype(np.float64))
+    color = np.abs(0.5 + CONSTANTS["SH_C0"] * stored["sh_dc"].astype(np.float64))
     return {
         "means": shift,
         "quats": np.maximum(_TURN * scales.min(axis=1, keepdims=True), 4 * pixel) / scales.max(axis=1, keepdims=True),
@@ -198,39 +188,40 @@ def _table_starts(config: FieldConfig) -> list[int]:
     return [level.first for level in grids[0].levels] if grids else [0]
 
 
-class _Reader:
-    def __init__(self, tensors: Mapping[str, NDArray[Any]], where: str) -> None:
-        self._tensors, self._where = tensors, where
+def tensor_of(
+    tensors: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, ...], where: str, *codes: str
+) -> NDArray[Any]:
+    """Return a tensor of a file, of a type with one of these codes, if there are any. Raises InputError."""
+    array = tensors.get(name)
+    if array is None:
+        raise InputError(f"{where}: has no tensor {name!r}; the file is damaged, or of another version")
+    if array.shape != shape or (codes and array.dtype.str[1:] not in codes):
+        types = " or ".join(np.dtype(code).name for code in codes)
+        raise InputError(
+            f"{where}: tensor {name!r} has shape {array.shape} and type {array.dtype}, but the scene needs {shape} "
+            f"{types}; the file is damaged"
+        )
+    return array
 
-    def tensor(self, name: str, shape: tuple[int, ...], *codes: str) -> NDArray[Any]:
-        array = self._tensors.get(name)
-        if array is None:
-            raise InputError(f"{self._where}: has no tensor {name!r}; the file is damaged, or of another version")
-        if array.shape != shape or array.dtype.str[1:] not in codes:
-            raise InputError(
-                f"{self._where}: tensor {name!r} is {array.dtype} {array.shape}, but the scene needs "
-                f"{' or '.join(np.dtype(code).name for code in codes)} {shape}; the file is damaged"
-            )
-        return array
 
-    def _outliers(self, name: str, size: int) -> tuple[NDArray[np.uint32], Floats]:
-        """Return the places and values of those that are stored exactly, none in most files."""
-        places = self._tensors.get(f"{name}.outliers", np.zeros(0, np.uint32))
-        places = self.tensor(f"{name}.outliers", (places.size,), "u4") if places.size else places
-        values = self.tensor(f"{name}.exact", places.shape, "f4") if places.size else np.zeros(0, np.float32)
-        if places.size and (places[-1] >= size or (places[1:] <= places[:-1]).any()):
-            raise InputError(
-                f"{self._where}: tensor '{name}.outliers' does not count places from 0 to {size - 1} in ascending "
-                "order; the file is damaged"
-            )
-        return places, values
-
-    def columns(self, name: str, rows: int, columns: int, starts: Sequence[int] = (0,)) -> Floats:
-        """Return a dequantized tensor (rows, columns)."""
-        whole = self.tensor(name, (columns, rows), "u1", "u2", "f4")
-        ranges = self.tensor(f"{name}.range", (len(starts), columns, 2), "f4")
-        with np.errstate(over="ignore", invalid="ignore"):
-            values = dequantize(Quantized(whole, ranges, *self._outliers(name, whole.size)), starts)
-        if not np.isfinite(values).all():
-            raise InputError(f"{self._where}: tensor {name!r} has a range beyond float32; the file is damaged")
-        return values
+def _columns(
+    tensors: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, ...], where: str, starts: Sequence[int] = (0,)
+) -> Floats:
+    """Return a dequantized tensor (rows, columns). shape: (columns, rows)."""
+    whole = tensor_of(tensors, name, shape, where, "u1", "u2", "f4")
+    ranges = tensor_of(tensors, f"{name}.range", (len(starts), shape[0], 2), where, "f4")
+    places, exact = np.zeros(0, np.uint32), np.zeros(0, np.float32)
+    if f"{name}.outliers" in tensors:
+        size = (tensors[f"{name}.outliers"].size,)
+        places = tensor_of(tensors, f"{name}.outliers", size, where, "u4")
+        exact = tensor_of(tensors, f"{name}.exact", size, where, "f4")
+    if (places[-1:] >= whole.size).any() or (places[1:] <= places[:-1]).any():
+        raise InputError(
+            f"{where}: tensor '{name}.outliers' does not count places from 0 to {whole.size - 1} in ascending order; "
+            "the file is damaged"
+        )
+    with np.errstate(over="ignore", invalid="ignore"):
+        values = dequantize(Quantized(whole, ranges, places, exact), starts)
+    if not np.isfinite(values).all():
+        raise InputError(f"{where}: tensor {name!r} has a range beyond float32; the file is damaged")
+    return values

@@ -48,7 +48,9 @@ def quantize(
     starts: first rows of the parts that have ranges of their own, ascending from 0.
     """
     most = np.broadcast_to(np.asarray(allowed, np.float64), values.shape)
-    best, fewest = None, 4.0 * values.size
+    identity, none = np.tile(np.array([0, 1], np.float32), (len(starts), values.shape[1], 1)), np.zeros(0, np.uint32)
+    best = Quantized(np.ascontiguousarray(values.T), identity, none, none.view(np.float32))
+    fewest = 4.0 * values.size
     for width in sorted({bits, max(bits, 8), 16}):
         found = _round(values, width, most, centered, starts)
         size = values.size * width / 8 + len(found.outliers) * _OUTLIER_BYTES
@@ -56,11 +58,7 @@ def quantize(
             best, fewest = found, size
         if not len(found.outliers):
             break
-    if best is not None:
-        return best
-    identity = np.broadcast_to(np.array([0, 1], np.float32), (len(starts), values.shape[1], 2))
-    none = np.zeros(0, np.uint32)
-    return Quantized(np.ascontiguousarray(values.T), np.ascontiguousarray(identity), none, none.view(np.float32))
+    return best
 
 
 def dequantize(quantized: Quantized, starts: Sequence[int] = (0,)) -> Floats:
@@ -118,12 +116,10 @@ def _interval(
 
 def _levels(exact: NDArray[np.float64], top: int, centered: bool) -> tuple[float, float]:
     """Return low and step of an interval that holds all values, each a float32."""
-    low, high = exact.min(initial=np.inf), exact.max(initial=-np.inf)
     if not len(exact):
         return 0.0, 0.0
-    if centered:
-        high = max(abs(low), abs(high))
-        low = -high
+    high = np.abs(exact).max() if centered else exact.max()
+    low = -high if centered else exact.min()
     step = np.array([(high - low) / top], np.float32)
     if centered:  # so that the step's multiples up to 127 are exact
         step = ((step.view(np.uint32) + 0x80) & 0xFFFFFF00).view(np.float32)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -15,11 +14,14 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.checkpoint import write_checkpoint
 from lapgs_wgpu.io.ply import GaussianSnapshot
+from lapgs_wgpu.io.regular_file import PathLike
 from lapgs_wgpu.motion.fields.config import MIN_SCALE, FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation, Deformed, Field, Nearby, TimeSamples
 from lapgs_wgpu.motion.fields.grid_field import GridField
+from lapgs_wgpu.motion.fields.hexplane_field import HexPlaneField
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion
-from lapgs_wgpu.motion.fields.make_field import check_own, make_field
+from lapgs_wgpu.motion.fields.mlp_field import MlpField
+from lapgs_wgpu.motion.fields.own_field import OwnField, check_own
 from lapgs_wgpu.motion.scene_file import SceneFile, read_scene, row_shapes, scene_header
 from lapgs_wgpu.motion.timing import EVEN, Timing
 from lapgs_wgpu.splat.camera import Camera
@@ -46,6 +48,17 @@ def isotropic_rows(
         / CONSTANTS["SH_C0"],
         "sh_rest": torch.zeros(n, 15, 3),
     }
+
+
+def make_field(config: FieldConfig, device: Device, seed: int = 0, own: nn.Module | None = None) -> Field | None:
+    """Make the field of this configuration; None for static scenes. own: the module of the field own."""
+    if own is not None:
+        return OwnField(own)
+    if config.kind == "mlp":
+        return MlpField(config, seed)
+    if config.kind == "hexplane":
+        return HexPlaneField(config, seed)
+    return None if config.kind == "static" else GridField(config, device, seed)
 
 
 class Scene4D:
@@ -75,11 +88,8 @@ class Scene4D:
     ) -> None:
         """Make a scene of Gaussians and a field that is new. Raises InputError where own_field does not fit the kind.
 
-        Args:
-            parameters: as the attribute; copied.
-            field_config: as the attribute, as are device, sh_degree and antialiased.
-            seed: of the field's initial parameters.
-            own_field: a module in place of the configured field (docs/api.md).
+        parameters: as the attribute; copied. seed: of the field's initial parameters. own_field: a module in place of
+        the configured field (docs/api.md). The others are as the attributes.
         """
         check_own(field_config, own_field)
         self.on_access: Callable[[str], None] = lambda part: None
@@ -111,16 +121,9 @@ class Scene4D:
     ) -> Scene4D:
         """A scene of isotropic Gaussians.
 
-        Args:
-            points: (N, 3) means, world units.
-            colors: (N, 3) in [0, 1].
-            scales: (N,) standard deviations, world units.
-            field_config: as for `Scene4D`.
-            opacity: of all Gaussians, in (0, 1).
-            antialiased: as for `Scene4D`.
-            device: None for the default adapter.
-            seed: as for `Scene4D`.
-            own_field: as for `Scene4D`.
+        points: (N, 3) means, world units. colors: (N, 3) in [0, 1]. scales: (N,) standard deviations, world units.
+        opacity: of all Gaussians, in (0, 1). device: None for the default adapter. field_config, antialiased, seed and
+        own_field are as for `Scene4D`.
         """
         parameters = isotropic_rows(points, colors, scales, opacity)
         parameters["dynamics"] = torch.zeros(len(points), field_config.dynamics_size)
@@ -180,13 +183,10 @@ class Scene4D:
         *,
         timing: Timing | None = None,
     ) -> Deformed:
-        """The Gaussians at time t, with what the losses of motion compare; differentiable as those of `at`.
+        """The Gaussians at time t, with what the losses of motion compare; t, timing and derivatives are those of `at`.
 
-        Args:
-            t: time in [0, 1].
-            nearby: where the smoothness loss looks; None without it.
-            time_samples: some of the Gaussians and further times of the field.
-            timing: takes the place of the scene's; None for the scene's.
+        nearby: where the smoothness loss looks; None without it. time_samples: some of the Gaussians and further times
+        of the field.
         """
         t = (timing or self.timing)(t)
         if self.on_device is not None and not torch.is_grad_enabled() and nearby is None and time_samples is None:
@@ -206,12 +206,11 @@ class Scene4D:
         if move.d_opacity is not None:
             opacities = (p["opacity_logits"] + move.d_opacity).sigmoid()
         means, scales = self._moved(move, canonical.means, canonical.scales)
-        at_times = []
-        if time_samples is not None:
-            rows = p["means"][time_samples.rows], canonical.scales[time_samples.rows]
-            at_times = [self._moved(other, *rows) for other in others]
         gaussians = Gaussians(means, quats, scales, opacities, sh, antialiased=self.antialiased)
-        return Deformed(gaussians, move.smoothness, at_times)
+        if time_samples is None:
+            return Deformed(gaussians, move.smoothness, [])
+        rows = p["means"][time_samples.rows], canonical.scales[time_samples.rows]
+        return Deformed(gaussians, move.smoothness, [self._moved(other, *rows) for other in others])
 
     def _moved(self, move: Deformation, means: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
         if move.d_scales is not None:
@@ -265,7 +264,7 @@ class Scene4D:
         means, log_scales, quats = (each.numpy(force=True) for each in (now.means, now.scales.log(), now.quats))
         return GaussianSnapshot(means, sh.numpy(force=True), logits.numpy(force=True), log_scales, quats)
 
-    def save(self, path: str | os.PathLike[str], metadata: Mapping[str, str] | None = None) -> None:
+    def save(self, path: PathLike, metadata: Mapping[str, str] | None = None) -> None:
         """Write the scene to one file, which 3DGS viewers open as a static scene at time 0 (docs/format.md). Atomic.
 
         Args:
@@ -283,7 +282,7 @@ class Scene4D:
         write_checkpoint(path, arrays, tensors, {**self.metadata, **(metadata or {}), **header})
 
 
-def load(path: str | os.PathLike[str], device: Device | None = None, *, field: nn.Module | None = None) -> Scene4D:
+def load(path: PathLike, device: Device | None = None, *, field: nn.Module | None = None) -> Scene4D:
     """Read a checkpoint, or any 3DGS .ply file as a static scene.
 
     Args:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -17,13 +16,13 @@ from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.io.dataclass_table import build_dataclass
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.io.lapgs_file import lapgs_bytes, pack_lapgs, unpack_lapgs
+from lapgs_wgpu.io.regular_file import PathLike
 from lapgs_wgpu.io.safe_json_toml import parse_json
-from lapgs_wgpu.motion.compact_scene import compress, expand
+from lapgs_wgpu.motion.compact_scene import compress, expand, tensor_of
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
 from lapgs_wgpu.motion.timing import EVEN, Timing, timing_of_text
 
-_MAX_DEGREE = 3
 _SHAPES = {
     "means": (3,),
     "log_scales": (3,),
@@ -44,7 +43,7 @@ class SceneFile:
     capture.
     """
 
-    path: str | os.PathLike[str]
+    path: PathLike
     field_config: FieldConfig
     sh_degree: int
     gaussians: dict[str, NDArray[np.float32]]
@@ -54,7 +53,7 @@ class SceneFile:
     timing: Timing = EVEN
 
 
-def read_scene(path: str | os.PathLike[str]) -> SceneFile:
+def read_scene(path: PathLike) -> SceneFile:
     """Read a checkpoint, a compact scene, or any 3DGS .ply file as a static scene. Raises InputError."""
     if (data := lapgs_bytes(path)) is not None:
         return read_compact(data, path)
@@ -62,29 +61,22 @@ def read_scene(path: str | os.PathLike[str]) -> SceneFile:
     if not tensors:
         sh = np.zeros((len(still.means), 16, 3), np.float32)
         sh[:, : still.sh.shape[1]] = still.sh
-        tensors = {
-            "gaussians.means": still.means,
-            "gaussians.log_scales": still.log_scales,
-            "gaussians.quats": still.quats,
-            "gaussians.opacity_logits": still.opacity_logits,
-            "gaussians.sh_dc": sh[:, :1],
-            "gaussians.sh_rest": sh[:, 1:],
-        }
+        stored = vars(still) | {"sh_dc": sh[:, :1], "sh_rest": sh[:, 1:]}
+        tensors = {f"gaussians.{name}": stored[name] for name in _SHAPES}
         metadata |= {"field": '{"kind": "static"}', "sh_degree": str(still.sh_degree)}
     header = _read_header(metadata, path)
     config, count = header["field_config"], len(still.means)
-    gaussians = {
-        name: _tensor(tensors, f"gaussians.{name}", (count, *shape), path) for name, shape in row_shapes(config).items()
-    }
+    rows = {name: (count, *shape) for name, shape in row_shapes(config).items()}
     # Before a module is created: a damaged description may ask for more memory than there is.
     shapes = parameter_shapes(config)
     if config.kind == "own":  # its module, which checks them, comes from elsewhere
         shapes = {name[6:]: array.shape for name, array in tensors.items() if name.startswith("field.")}
-    field = {name: _tensor(tensors, f"field.{name}", shape, path) for name, shape in shapes.items()}
+    gaussians = {name: _float32(tensors, f"gaussians.{name}", shape, path) for name, shape in rows.items()}
+    field = {name: _float32(tensors, f"field.{name}", shape, path) for name, shape in shapes.items()}
     return SceneFile(path, gaussians=gaussians, field=field, **header)
 
 
-def read_compact(data: bytes, path: str | os.PathLike[str]) -> SceneFile:
+def read_compact(data: bytes, path: PathLike) -> SceneFile:
     """As `read_scene`, of the bytes of a compact scene. path: where they are from."""
     tensors, metadata = unpack_lapgs(data, str(path))
     header = _read_header(metadata, path)
@@ -107,7 +99,7 @@ def compact_bytes(file: SceneFile, static_features: NDArray[np.float32] | None, 
     header = scene_header(config, file.sh_degree, file.antialiased, file.timing)
     look = InitialView.from_json(file.metadata.get("view", ""))
     try:
-        tensors = compress(gaussians, file.field, config, file.sh_degree, look, finer=finer)
+        tensors = compress(gaussians, file.field, config, file.sh_degree, look, finer)
         return pack_lapgs(tensors, file.metadata | header)
     except InputError as error:
         raise InputError(f"{file.path}: no compact scene can be made of it, because {error}") from error
@@ -129,36 +121,32 @@ def row_shapes(config: FieldConfig) -> dict[str, tuple[int, ...]]:
     return _SHAPES | ({"dynamics": (size,)} if size else {})
 
 
-def _read_header(metadata: Mapping[str, str], path: str | os.PathLike[str]) -> dict[str, Any]:
+def _read_header(metadata: Mapping[str, str], path: PathLike) -> dict[str, Any]:
     """Return the attributes of a SceneFile that its texts hold, and the others of these."""
+    others = dict(metadata)
     try:
-        config = build_dataclass(FieldConfig, parse_json(metadata["field"], "its text"), "field")
-        degree = int(metadata["sh_degree"])
-        if not 0 <= degree <= _MAX_DEGREE:
-            raise ValueError(f"sh_degree {degree} is outside 0 to {_MAX_DEGREE}")
-        antialiased = metadata.get("antialiased", "false")  # older files lack it
+        config = build_dataclass(FieldConfig, parse_json(others.pop("field"), "its text"), "field")
+        degree = int(others.pop("sh_degree"))
+        if not 0 <= degree <= 3:
+            raise ValueError(f"sh_degree {degree} is outside 0 to 3")
+        antialiased = others.pop("antialiased", "false")  # older files lack it
         if antialiased not in ("false", "true"):
             raise ValueError(f"antialiased {antialiased!r} is neither true nor false")
-        timing = timing_of_text(metadata["timing"]) if "timing" in metadata else EVEN
+        timing = timing_of_text(others.pop("timing")) if "timing" in others else EVEN
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         reason = f"{type(error).__name__}: {error}"[:200]
         raise InputError(
             f"{path}: the checkpoint's description of its field cannot be read ({reason}): "
             "it was damaged, or written by another version of lapgs_wgpu"
         ) from error
-    others = {key: text for key, text in metadata.items() if key not in ("field", "sh_degree", "antialiased", "timing")}
     described = {"field_config": config, "sh_degree": degree, "antialiased": antialiased == "true", "timing": timing}
     return described | {"metadata": others}
 
 
-def _tensor(
-    tensors: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, ...], path: str | os.PathLike[str]
+def _float32(
+    tensors: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, ...], path: PathLike
 ) -> NDArray[np.float32]:
-    if name not in tensors:
-        raise InputError(f"{path}: the checkpoint has no tensor {name!r}: it was damaged or written by another version")
-    array = tensors[name]
-    if array.shape != shape:
-        raise InputError(f"{path}: tensor {name!r} has shape {array.shape}, but the scene needs {shape}")
+    array = tensor_of(tensors, name, shape, str(path))
     values = array.astype(np.float32, copy=False)
     if values is not array and not np.isfinite(values).all():  # all values are finite before the conversion
         raise InputError(f"{path}: tensor {name!r} holds values beyond float32: it was written by another program")

@@ -14,7 +14,8 @@ from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.gpu.recording import Recording
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.passes.activation_passes import ActivationPasses, Line
-from lapgs_wgpu.motion.passes.grid_field_passes import Comparison, Decoding, GridFieldPasses
+from lapgs_wgpu.motion.passes.decoder_passes import Decoding
+from lapgs_wgpu.motion.passes.grid_field_passes import GridFieldPasses
 from lapgs_wgpu.motion.passes.samples import Samples
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.drawing import Drawing, GaussianGradients
@@ -58,8 +59,8 @@ class Task:
 
 # The passes of a step: its drawing, and what is read of it later.
 Recorded = tuple[Drawing, list[DeviceArray]]
-# The field at the time of a step, and for the losses of smoothness and acceleration; None where a step is without.
-Decodings = tuple[Decoding | None, Comparison | None, Line | None]
+# The field at the time of a step, and for the loss of acceleration; None where a step is without.
+Decodings = tuple[Decoding | None, Line | None]
 
 
 class ResidentPasses:
@@ -167,17 +168,14 @@ class ResidentPasses:
         """Record the field; what varies from step to step is asked for anew."""
         field, values = self._field, self.parameters.arrays("value")
         if field is None or not task.scheduled.moving:
-            return None, None, None
-        decoding, comparison, line = field.decode(commands, 0, values, lambda: self._task.time), None, None
-        if task.near is not None:
-            near = self._of_task("near")
-            comparison = field.compare(commands, 1, values, decoding.time, near, lambda: self._task.near_time)
+            return None, None
+        decoding, line = field.decode(commands, 0, values, lambda: self._task.time), None
         if task.even is not None:
             even, config = self._of_task("even"), self._config.acceleration
             before = field.decode(commands, 3, values, lambda: self._task.even_times[0], even)
             after = field.decode(commands, 4, values, lambda: self._task.even_times[1], even)
             line = Line(decoding, before, after, config.weight * config.interval / task.even.count)
-        return decoding, comparison, line
+        return decoding, line
 
     def _of_task(self, name: str) -> Callable[[], Any]:
         return lambda: getattr(self._task, name)
@@ -196,23 +194,23 @@ class ResidentPasses:
     ) -> None:
         """Record the losses of motion, and the gradients of the parameters from those of what was drawn."""
         passes, field, smooth = self._activation, self._field, self._config.smoothness
-        decoding, comparison, line = decodings
+        decoding, line = decodings
         values, gradients = self.parameters.arrays("value"), self.parameters.arrays("gradient")
         if line is not None:
-            accelerations = passes.acceleration(commands, line, values.geometry, drawn)
+            accelerations = passes.acceleration(commands, line, values.geometry, drawn, by_drawn, gradients.geometry)
             self._total(commands, accelerations, "acceleration", line.scale, totals)
-            passes.acceleration_bwd(commands, line, values.geometry, drawn, by_drawn, gradients.geometry)
         d_sh = self.parameters.blocks["sh"].arrays["gradient"]
         passes.activate_bwd(commands, values.geometry, drawn, by_drawn, decoding, gradients.geometry, d_sh)
         if field is None or decoding is None:
             return
         for each in (decoding, *(() if line is None else (line.before, line.after))):
             field.decode_bwd(commands, each, values, gradients)
-        if comparison is not None:
-            weights = [weight / comparison.points[0].count for weight in (smooth.static, smooth.temporal)]
-            for total, sums, weight in zip(TOTALS, comparison.sums, weights, strict=False):
+        if self._task.near is not None:
+            weights = [weight / self._task.near.count for weight in (smooth.static, smooth.temporal)]
+            near, times = self._of_task("near"), (decoding.time, self._of_task("near_time"))
+            differences = field.compare(commands, values, gradients, near, times, weights)
+            for total, sums, weight in zip(TOTALS, differences, weights, strict=False):
                 self._total(commands, sums, total, weight, totals)
-            field.compare_bwd(commands, comparison, gradients, weights)
         if self.dynamics_loss:
             self._dynamics(commands, values.beside, gradients.beside, totals)
 

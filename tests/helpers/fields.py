@@ -10,7 +10,7 @@ from lapgs_wgpu.motion.fields.config import FieldConfig, PlaneConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation, Field, Nearby
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.fields.hash_grid_config import HashConfig
-from lapgs_wgpu.motion.fields.make_field import make_field
+from lapgs_wgpu.motion.scene import make_field
 
 OURS = FieldConfig(
     kind="laplacian",

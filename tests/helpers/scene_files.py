@@ -114,7 +114,7 @@ DAMAGE: dict[str, tuple[Callable[[dict[str, Any], dict[str, str]], object], str]
     "times alone": (lambda _, m: m.update(timing='{"times": [0]}'), "timing is no table of times and moments"),
     "time that goes back": (
         lambda _, m: m.update(timing='{"times": [0, 1], "moments": [0.5, 0.4]}'),
-        "timing.moments descend",
+        "never descend",
     ),
     "unknown kind": (with_field(kind="quantum"), "kind must be static or .*, got 'quantum'"),
     "unknown key": (with_field(color="red"), "description of its field"),

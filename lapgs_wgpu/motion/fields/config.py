@@ -17,6 +17,7 @@ Appearance = Literal["none", "color", "color+opacity"]
 MIN_SCALE = CONSTANTS["MIN_SCALE"]
 TEMPORAL_AXES = ((0, 1, TIME), (1, 2, TIME), (0, 2, TIME))  # of the temporal hash grids
 GEOMETRY = (4, 3, 4, 3)  # outputs of the grid fields' geometry heads: turn, shift, quaternion, scale
+_DEVICE_WIDTH = 2048  # largest width of a decoder that kernels evaluate
 # Factor of the appearance head's outputs. The head then learns about as fast as the colors; faster, it would explain
 # motion by changes of color.
 APPEARANCE_SCALE = 0.1
@@ -120,8 +121,9 @@ class FieldConfig(Options):
     @property
     def decodes_on_device(self) -> bool:
         """Whether kernels for the field's decoder exist: for grid4d and laplacian without hidden layers, except for the
-        ablation that replaces the spectrum by an MLP."""
-        return not self.depth and (self.kind == "grid4d" or (self.kind == "laplacian" and self.motion == "laplacian"))
+        ablation that replaces the spectrum by an MLP. In wider ones their loops exceed SOFTWARE_LOOP_TURNS."""
+        kernels = self.kind == "grid4d" or (self.kind == "laplacian" and self.motion == "laplacian")
+        return kernels and not self.depth and self.width <= _DEVICE_WIDTH
 
     def grid_time(self, t: float) -> float:
         """Return the position on the temporal grids' time axis, in [0, 1], of a time in [0, 1]."""

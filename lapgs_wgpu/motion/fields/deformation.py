@@ -1,4 +1,4 @@
-"""The interface of all deformation fields.
+"""The interface of all deformation fields, and their linear layers.
 
 A field is a `Field` with the call field(means, t, dynamics, nearby) -> Deformation. means: (N, 3) canonical, world
 units; the field gives them no gradient. t: in [0, 1]. dynamics: (N, D) or None. nearby: a Nearby or None.
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import torch
 from torch import Tensor, nn
 
 from lapgs_wgpu.splat.gaussians import Gaussians
@@ -59,8 +60,13 @@ class Field(nn.Module):
         return moves
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Return the parameters by learning rate: "hash" (tables and planes) and "mlp"."""
-        return {"mlp": list(self.parameters())}
+        """Return the parameters by learning rate: "hash" (tables and planes) and "mlp". The spectrum's frequencies, in
+        no group, have their own optimizer."""
+        groups: dict[str, list[nn.Parameter]] = {"hash": [], "mlp": []}
+        for name, parameter in self.named_parameters():
+            if name != "motion.frequencies":
+                groups["hash" if "grid" in name or "planes" in name else "mlp"].append(parameter)
+        return {name: group for name, group in groups.items() if group}
 
 
 class Deformation(NamedTuple):
@@ -104,3 +110,22 @@ class Deformed(NamedTuple):
     gaussians: Gaussians[Tensor]
     smoothness: Tensor | None
     at_times: list[tuple[Tensor, Tensor]]
+
+
+def linear(shape: tuple[int, ...], generator: torch.Generator) -> nn.Linear:
+    """Return a linear layer with a weight of this shape (outputs, inputs) and torch's own initial distribution."""
+    layer = zero_head(shape)
+    reach = shape[1] ** -0.5
+    with torch.no_grad():
+        layer.weight.uniform_(-reach, reach, generator=generator)
+        layer.bias.uniform_(-reach, reach, generator=generator)
+    return layer
+
+
+def zero_head(shape: tuple[int, ...]) -> nn.Linear:
+    """Return a linear layer with a weight of this shape (outputs, inputs), all zero: it starts without effect."""
+    outputs, inputs = shape
+    layer = nn.Linear(inputs, outputs)
+    nn.init.zeros_(layer.weight)
+    nn.init.zeros_(layer.bias)
+    return layer

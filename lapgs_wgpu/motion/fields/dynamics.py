@@ -16,22 +16,17 @@ def outliers(d: Tensor) -> Tensor:
 
     The standard deviation of the N distances is divided by N, not by N - 1. If all rows are equal, none is an outlier.
     """
-    return _outliers(_offsets(d.detach()))
+    distances = _offsets(d.detach()).norm(dim=1).double()
+    mean = distances.mean()
+    deviation = (distances - mean).square().mean().sqrt()
+    return distances > (1 + ROUNDING) * mean + deviation
 
 
 def dynamics_loss(d: Tensor) -> Tensor:
     """L_dy (eq. 12), a scalar: the sum of the outliers' squared distances, divided by N. Its descent pulls them to the
     mean row. The mean row and the choice of the outliers are constants to the gradient."""
-    offsets = _offsets(d)
-    return (_outliers(offsets.detach()) * offsets.square().sum(dim=1)).sum() / max(len(d), 1)
+    return (outliers(d) * _offsets(d).square().sum(dim=1)).sum() / max(len(d), 1)
 
 
 def _offsets(d: Tensor) -> Tensor:
     return d - d.detach().mean(dim=0)
-
-
-def _outliers(offsets: Tensor) -> Tensor:
-    distances = offsets.norm(dim=1).double()
-    mean = distances.mean()
-    deviation = (distances - mean).square().mean().sqrt()
-    return distances > (1 + ROUNDING) * mean + deviation

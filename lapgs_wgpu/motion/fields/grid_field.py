@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import torch
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import GEOMETRY, TEMPORAL_AXES, FieldConfig
-from lapgs_wgpu.motion.fields.deformation import Deformation, Field, Nearby, TimeSamples
+from lapgs_wgpu.motion.fields.deformation import Deformation, Field, Nearby, TimeSamples, linear, zero_head
 from lapgs_wgpu.motion.fields.hash_encoder import HashEncoder, HashGrid
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion, TimeMotion
-from lapgs_wgpu.motion.fields.layers import linear, zero_head
 from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
-from lapgs_wgpu.motion.fields.torch_decoder import KEPT, DecoderWeights, decode
-
-_BLOCK = 1 << 13  # Gaussians per block decoded by hidden layers
+from lapgs_wgpu.motion.fields.torch_decoder import DecoderWeights, decode
 
 
 class GridField(Field):
@@ -33,25 +27,25 @@ class GridField(Field):
     def __init__(self, config: FieldConfig, device: Device, seed: int) -> None:
         super().__init__()
         generator = torch.Generator().manual_seed(seed)
-        ours = config.kind == "laplacian"
-        self.config = config
+        self.config, shapes = config, parameter_shapes(config)
+
+        def layer(name: str) -> nn.Linear:
+            return linear(shapes[f"{name}.weight"], generator)
+
         self.static_grid = HashGrid(config.static, (0, 1, 2), generator)
         axes = TEMPORAL_AXES if config.temporal_hash else ()
         self.temporal_grids = nn.ModuleList(HashGrid(config.temporal, three, generator) for three in axes)
         groups = [[self.static_grid], self.grids[1:]] if axes else [[self.static_grid]]
         self._encoder = HashEncoder(device, groups, config.bound)
-        static = self.static_grid.features
-        shapes = parameter_shapes(config)
-        self.spatial = linear(shapes["spatial.weight"], generator)
-        self.temporal = linear(shapes["temporal.weight"], generator)
-        hidden = [(linear(shapes[f"hidden.{2 * i}.weight"], generator), nn.ReLU()) for i in range(config.depth)]
-        self.hidden = nn.Sequential(*(layer for pair in hidden for layer in pair))
+        self.spatial = layer("spatial")
+        self.temporal = layer("temporal")
+        hidden = [(layer(f"hidden.{2 * i}"), nn.ReLU()) for i in range(config.depth)]
+        self.hidden = nn.Sequential(*(each for pair in hidden for each in pair))
         self.heads = zero_head(shapes["heads.weight"])
         self.motion: LaplacianMotion | TimeMotion | None = None
-        if ours and config.motion == "laplacian":
-            self.motion = LaplacianMotion(static, config, generator)
-        elif ours:
-            self.motion = TimeMotion(static, config.width, generator)
+        if config.kind == "laplacian":
+            kind = LaplacianMotion if config.motion == "laplacian" else TimeMotion
+            self.motion = kind(self.static_grid.features, config, generator)
         self.appearance = zero_head(shapes["appearance.weight"]) if config.appearance_size else None
 
     @property
@@ -74,82 +68,52 @@ class GridField(Field):
         time_samples: TimeSamples | None = None,
     ) -> list[Deformation]:
         """See motion/fields/deformation.py. All are encoded together, which takes much less time than apart."""
-        now, *others, sq_distances = self._outputs(means, t, dynamics, nearby, time_samples)
-        smoothness = _smoothness(sq_distances, nearby) if nearby is not None else None
-        return [self._deformation(now)._replace(smoothness=smoothness), *map(self._deformation, others)]
-
-    def _deformation(self, outputs: Tensor) -> Deformation:
-        geometry, look = outputs[:, : sum(GEOMETRY)], outputs[:, sum(GEOMETRY) :] if self.appearance else None
-        turn, shift, d_quats, d_scales = geometry.split(GEOMETRY, dim=1)
-        rotation = nn.functional.normalize(turn + turn.new_tensor([1.0, 0.0, 0.0, 0.0]), dim=1)
-        return Deformation(
-            rotation,
-            shift,
-            d_quats,
-            d_scales,
-            look[:, :3] if look is not None else None,
-            look[:, 3] if look is not None and look.shape[1] > 3 else None,
-        )
-
-    def _outputs(
-        self, means: Tensor, t: float, dynamics: Tensor | None, nearby: Nearby | None, time_samples: TimeSamples | None
-    ) -> list[Tensor]:
-        """Return outputs of the geometry heads (N, 14) and, in further columns, of the appearance head.
-
-        The same (M, 14) of each sampled time follow; then the sums of the squared differences between features of
-        nearby points, for spatial and for space-time features.
-        """
-        places = [(means, self.config.grid_time(t))]
+        places, decoded = [(means, self.config.grid_time(t))], [(t, dynamics)]
         if nearby is not None:
             places.append((means[nearby.rows] + nearby.offsets, self.config.grid_time(nearby.time)))
-        decoded = [(t, dynamics)]
         if time_samples is not None:
             their_means, their_dynamics = time_samples.chosen(means, dynamics)
             places += [(their_means, self.config.grid_time(time)) for time in time_samples.times]
             decoded += [(time, their_dynamics) for time in time_samples.times]
         here, *others = self._encoder.encode_all(places)
-        sq_distances = []
+        smoothness = None
         if nearby is not None:
             near, *others = others
-            sq_distances = [(b - a[nearby.rows]).square().sum() for a, b in zip(here, near, strict=True)]
+            smoothness = _smoothness(here, near, nearby)
         outputs = [self._decode(*given, *each) for given, each in zip(decoded, [here, *others], strict=True)]
-        return [*outputs, torch.stack(sq_distances) if sq_distances else means.new_zeros(0)]
+        now, *later = map(self._deformation, outputs)
+        return [now._replace(smoothness=smoothness), *later]
+
+    def _deformation(self, outputs: Tensor) -> Deformation:
+        size = self.config.appearance_size
+        turn, shift, d_quats, d_scales, look = outputs.split((*GEOMETRY, size), dim=1)
+        rotation = nn.functional.normalize(turn + turn.new_tensor([1.0, 0.0, 0.0, 0.0]), dim=1)
+        d_dc, d_opacity = look[:, :3] if size else None, look[:, 3] if size == 4 else None
+        return Deformation(rotation, shift, d_quats, d_scales, d_dc, d_opacity)
 
     def _decode(self, t: float, dynamics: Tensor | None, static: Tensor, temporal: Tensor | None = None) -> Tensor:
         """Return the outputs of the geometry heads (N, 14) and, in further columns, of the appearance head."""
         count, size = len(static), self.config.dynamics_size
         temporal = static.new_zeros(count, 0) if temporal is None else temporal
-        inputs = static, temporal, dynamics if size and dynamics is not None else static.new_zeros(count, size)
+        dynamics = dynamics if size and dynamics is not None else static.new_zeros(count, size)
+        outputs = decode(static, temporal, dynamics, self._weights(t))
         if not len(self.hidden):
-            return decode(*inputs, self._weights(t))
-        # In blocks, which avoids large allocations. For many Gaussians the backward pass computes them again: the
-        # activations, 4 KB per Gaussian at a width of 256, would be most of a training's memory.
-        decode_block = self._decode_hidden
-        if len(static) > KEPT:
-            decode_block = partial(checkpoint, decode_block, use_reentrant=False, preserve_rng_state=False)
-        blocks = zip(*(part.split(_BLOCK) for part in inputs), strict=True)
-        return torch.cat([decode_block(t, *block) for block in blocks])
-
-    def _decode_hidden(self, t: float, static: Tensor, temporal: Tensor, dynamics: Tensor) -> Tensor:
-        """Return the same after the hidden layers: `decode` gives what these read, and the gated channels, which the
-        appearance head reads."""
-        fused, *gated = decode(static, temporal, dynamics, self._weights(t)).split(self.config.width, dim=1)
-        outputs = [self.heads(self.hidden(fused))]
-        if self.appearance is not None:
-            outputs.append(self.appearance(*gated))
-        return torch.cat(outputs, dim=1) * self._head_factors()
+            return outputs
+        fused, *gated = outputs.split(self.config.width, dim=1)
+        look = [] if self.appearance is None else [self.appearance(*gated)]
+        return torch.cat([self.heads(self.hidden(fused)), *look], dim=1) * self._head_factors()
 
     def _weights(self, t: float) -> DecoderWeights:
         """Return the decoder's weights at a time.
 
         The second layer of the motion, which only linear layers follow, is folded into the heads, and all heads are one
         matrix, so that the features' gradient (N, width) is written once. Before hidden layers the heads are the
-        identity.
+        identity, once more for the gated channels, which the appearance head reads.
         """
         size = self.config.dynamics_size
         if len(self.hidden):
-            identity, moved = torch.eye(self.config.width), self.config.width
-            heads = torch.cat([identity] if self.appearance is None else [identity, identity])
+            moved = self.config.width
+            heads = torch.eye(moved).repeat(1 if self.appearance is None else 2, 1)
             bias = heads.new_zeros(len(heads))
         else:
             layers = [self.heads] if self.appearance is None else [self.heads, self.appearance]
@@ -181,16 +145,9 @@ class GridField(Field):
     def _head_factors(self) -> Tensor:
         return self.heads.bias.new_tensor(self.config.head_factors)
 
-    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """See motion/fields/deformation.py. The spectrum's frequencies, in no group, have their own optimizer."""
-        tables = [grid.table for grid in self.grids]
-        excluded = {id(table) for table in tables}
-        if isinstance(self.motion, LaplacianMotion):
-            excluded.add(id(self.motion.frequencies))
-        return {"hash": tables, "mlp": [p for p in self.parameters() if id(p) not in excluded]}
 
-
-def _smoothness(sq_distances: Tensor, nearby: Nearby) -> Tensor:
+def _smoothness(here: list[Tensor], near: list[Tensor], nearby: Nearby) -> Tensor:
     """Grid4D's smoothness loss: the mean squared distance between the features of near places, static and temporal."""
+    sq_distances = torch.stack([(b - a[nearby.rows]).square().sum() for a, b in zip(here, near, strict=True)])
     weights = sq_distances.new_tensor([nearby.static_weight, nearby.temporal_weight][: len(sq_distances)])
     return (weights * sq_distances).sum() / max(1, len(nearby.rows))

@@ -48,11 +48,10 @@ def make_levels(config: HashConfig) -> list[Level]:
     levels, first = [], 0
     for number in range(config.levels):
         share = number / max(1, config.levels - 1)
-        exact = [a * (b / a) ** share for a, b in zip(config.base, config.finest, strict=True)]
-        resolution = [math.ceil(size - 1e-9) for size in exact]
+        x, y, z = (a * (b / a) ** share for a, b in zip(config.base, config.finest, strict=True))
+        resolution = math.ceil(x - 1e-9), math.ceil(y - 1e-9), math.ceil(z - 1e-9)
         entries = min(1 << config.table_log2, math.prod(resolution))
-        x, y, z = exact
-        levels.append(Level((x - 1, y - 1, z - 1), (resolution[0], resolution[1], resolution[2]), entries, first))
+        levels.append(Level((x - 1, y - 1, z - 1), resolution, entries, first))
         first += entries
     return levels
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 
 from lapgs_wgpu.motion.fields.config import FieldConfig
-from lapgs_wgpu.motion.fields.deformation import Deformation, Field, Nearby
+from lapgs_wgpu.motion.fields.deformation import Deformation, Field, Nearby, linear, zero_head
 from lapgs_wgpu.motion.fields.hash_grid_config import TIME
-from lapgs_wgpu.motion.fields.layers import linear, zero_head
 from lapgs_wgpu.motion.fields.parameter_shapes import HEXPLANE_HEADS, PLANES, parameter_shapes
 
 # Weights of the smoothness loss that 4D-GS trains with on D-NeRF scenes.
@@ -59,13 +60,11 @@ class HexPlaneField(Field):
 
     def _features(self, unit: Tensor, first: int) -> Tensor:
         """Return features (N, F) at points and times (N, 4) in [-1, 1], of the six planes from number `first` on."""
-        product: Tensor | None = None
+        features = []
         for plane, pair in zip(list(self.planes)[first : first + len(PLANES)], PLANES, strict=True):
             at = unit[None, None, :, list(pair)]
-            values = nn.functional.grid_sample(plane, at, align_corners=True, padding_mode="border")[0, :, 0].T
-            product = values if product is None else product * values
-        assert product is not None
-        return product
+            features.append(nn.functional.grid_sample(plane, at, align_corners=True, padding_mode="border")[0, :, 0].T)
+        return math.prod(features[1:], start=features[0])
 
     def _smoothness(self) -> Tensor:
         """4D-GS's: squared second differences along the second axis of each plane; time planes close to one."""
@@ -77,9 +76,3 @@ class HexPlaneField(Field):
             else:
                 total = total + SPACE_SMOOTHNESS * bend.square().mean()
         return total
-
-    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """See motion/fields/deformation.py."""
-        planes = list(self.planes)
-        excluded = {id(plane) for plane in planes}
-        return {"hash": planes, "mlp": [p for p in self.parameters() if id(p) not in excluded]}

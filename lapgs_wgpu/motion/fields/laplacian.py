@@ -8,8 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from lapgs_wgpu.motion.fields.config import FieldConfig
-from lapgs_wgpu.motion.fields.layers import linear
-from lapgs_wgpu.motion.fields.parameter_shapes import laplacian_motion, time_motion
+from lapgs_wgpu.motion.fields.deformation import linear
 
 VARIANCE_FLOOR = 1e-4
 # A component's variance counts as at most this times the geometric mean of all, and at least 1 / this.
@@ -30,14 +29,14 @@ class LaplacianMotion(nn.Module):
         super().__init__()
         # Small, and smaller at higher frequencies, as in smooth motion: otherwise the heads would learn to explain
         # single images by flicker. Not zero: if both factors were zero, the product would have no gradient.
-        shapes = laplacian_motion(inputs, config.width, config.components)
+        shape = config.components, config.width
         fall = 1.0 / torch.arange(config.components).clamp(min=1)[:, None]
         size = config.amplitude * fall / fall.square().sum().sqrt()
-        self.alpha = nn.Parameter(torch.randn(shapes["alpha"], generator=generator) * size)
-        self.beta = nn.Parameter(torch.randn(shapes["beta"], generator=generator) * size)
+        self.alpha = nn.Parameter(torch.randn(shape, generator=generator) * size)
+        self.beta = nn.Parameter(torch.randn(shape, generator=generator) * size)
         self.frequencies = nn.Parameter(config.frequency_step * torch.arange(config.components, dtype=torch.float32))
-        self.first = linear(shapes["first.weight"], generator)
-        self.second = linear(shapes["second.weight"], generator)
+        self.first = linear((config.width, inputs), generator)
+        self.second = linear((config.width, config.width), generator)
 
     def series(self, t: float) -> Tensor:
         """L(t), (W,), at a time in [0, 1]."""
@@ -49,37 +48,31 @@ class LaplacianMotion(nn.Module):
         series = self.series(t)
         return (self.first.weight, self.first.bias), (series[:, None] * self.second.weight, series * self.second.bias)
 
-    def amplitudes(self) -> Tensor:
-        """Return |c_k|, (K,): root mean over the channels of alpha^2 + beta^2; without gradient."""
-        with torch.no_grad():
-            return (self.alpha.square() + self.beta.square()).mean(dim=1).sqrt()
-
+    @torch.no_grad()
     def variances(self) -> Tensor:
         """Return sigma_k^2 of eq. 5, (K,): the variance of each component over time; without gradient.
 
         It is limited to a factor around the geometric mean, so that the frequencies of small components stay stable.
         """
-        variance = 0.5 * self.amplitudes().square() + VARIANCE_FLOOR
+        amplitudes = (self.alpha.square() + self.beta.square()).mean(dim=1).sqrt()
+        variance = 0.5 * amplitudes.square() + VARIANCE_FLOOR
         middle = variance.log().mean().exp()
         return variance.clamp(middle / VARIANCE_SPREAD, middle * VARIANCE_SPREAD)
 
     def frequency_gradient(self) -> Tensor:
         """Return the gradient of eq. 5, (K,): the loss's derivative by f_k, divided by 2 pi sigma_k^2. (The equation
         omits the factor 2 pi of the derivative of cos(2 pi f t).) Requires a previous backward pass."""
-        gradient = self.frequencies.grad
-        if gradient is None:
-            raise ValueError("frequency_gradient needs the gradient of the frequencies: call backward() first")
-        return gradient / (2 * math.pi * self.variances())
+        assert self.frequencies.grad is not None
+        return self.frequencies.grad / (2 * math.pi * self.variances())
 
 
 class TimeMotion(nn.Module):
     """The replacement of LaplacianMotion in its ablation: an MLP of (H_s, t) of equal size."""
 
-    def __init__(self, inputs: int, width: int, generator: torch.Generator) -> None:
+    def __init__(self, inputs: int, config: FieldConfig, generator: torch.Generator) -> None:
         super().__init__()
-        shapes = time_motion(inputs, width)
-        self.first = linear(shapes["first.weight"], generator)
-        self.second = linear(shapes["second.weight"], generator)
+        self.first = linear((config.width, inputs + 1), generator)
+        self.second = linear((config.width, config.width), generator)
 
     def layers(self, t: float) -> tuple[Layer, Layer]:
         """Return layers as LaplacianMotion.layers does; the time, the last input, is part of the bias."""

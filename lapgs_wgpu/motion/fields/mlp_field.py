@@ -8,8 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from lapgs_wgpu.motion.fields.config import FieldConfig
-from lapgs_wgpu.motion.fields.deformation import Deformation, Field, Nearby
-from lapgs_wgpu.motion.fields.layers import linear, zero_head
+from lapgs_wgpu.motion.fields.deformation import Deformation, Field, Nearby, linear, zero_head
 from lapgs_wgpu.motion.fields.parameter_shapes import (
     MLP_LAYERS,
     MLP_OUTPUTS,

@@ -23,17 +23,6 @@ def parameter_shapes(config: FieldConfig) -> Shapes:
     return _grid(config) if config.kind in ("grid4d", "laplacian") else {}
 
 
-def laplacian_motion(inputs: int, width: int, components: int) -> Shapes:
-    """Return the shapes of the parameters of LaplacianMotion."""
-    series: Shapes = {"alpha": (components, width), "beta": (components, width), "frequencies": (components,)}
-    return series | _layer("first", width, inputs) | _layer("second", width, width)
-
-
-def time_motion(inputs: int, width: int) -> Shapes:
-    """Return the shapes of the parameters of TimeMotion."""
-    return _layer("first", width, inputs + 1) | _layer("second", width, width)
-
-
 def _layer(name: str, outputs: int, inputs: int) -> Shapes:
     return {f"{name}.weight": (outputs, inputs), f"{name}.bias": (outputs,)}
 
@@ -48,10 +37,11 @@ def _grid(config: FieldConfig) -> Shapes:
         shapes |= _layer(f"hidden.{2 * i}", width, width)
     shapes |= _layer("heads", sum(GEOMETRY), width)
     if config.kind == "laplacian":
-        spectrum = config.motion == "laplacian"
-        motion = laplacian_motion(static.features, width, config.components)
-        motion = motion if spectrum else time_motion(static.features, width)
-        shapes |= {f"motion.{name}": shape for name, shape in motion.items()}
+        spectrum, series = config.motion == "laplacian", (config.components, width)
+        if spectrum:
+            shapes |= {"motion.alpha": series, "motion.beta": series, "motion.frequencies": series[:1]}
+        shapes |= _layer("motion.first", width, static.features + (0 if spectrum else 1))
+        shapes |= _layer("motion.second", width, width)
     if config.appearance_size:
         shapes |= _layer("appearance", config.appearance_size, width)
     return shapes

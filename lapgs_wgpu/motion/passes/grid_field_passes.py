@@ -5,6 +5,7 @@ Everything stays in device arrays. Gradients are added to arrays that the caller
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -13,9 +14,9 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.config import FieldConfig, static_grid, temporal_grids
-from lapgs_wgpu.motion.passes.decoder_passes import DecoderPasses, FieldWeights, Heads, Time
+from lapgs_wgpu.motion.passes.decoder_passes import DecoderPasses, Decoding, FieldWeights, Time
 from lapgs_wgpu.motion.passes.hash_encoder_passes import HashEncoderPasses, PointSet
-from lapgs_wgpu.motion.passes.samples import SamplePasses, Samples, Sampling
+from lapgs_wgpu.motion.passes.samples import SamplePasses, Sampling
 
 
 class FieldArrays(NamedTuple):
@@ -31,106 +32,39 @@ class FieldArrays(NamedTuple):
     weights: DeviceArray
 
 
-class Decoding(NamedTuple):
-    """Gaussians at a time that were decoded. name: distinguishes them.
-
-    time: gives that of the field, in [0, 1]. sampling: gives those of the Gaussians; None for all, in their order.
-    points, inputs: of encoder and decoder. heads: at that time. outputs: (count, outputs) of the heads, without their
-    biases; before `backward` they become their gradient.
-    """
-
-    name: str
-    time: Time
-    sampling: Sampling | None
-    points: PointSet
-    inputs: dict[str, DeviceArray]
-    heads: Heads
-    outputs: DeviceArray
-
-
-class Comparison(NamedTuple):
-    """Features of sampled Gaussians, and of places and a time near them, for each group of grids. sums: (count,)
-    squared differences of each."""
-
-    points: tuple[PointSet, PointSet]
-    here: list[DeviceArray]
-    there: list[DeviceArray]
-    sums: list[DeviceArray]
-
-
-class _Group(NamedTuple):
-    """Grids that are encoded together. tables: theirs among all; features: of a point."""
-
-    encoder: HashEncoderPasses
-    tables: slice
-    features: int
-
-
 class GridFieldPasses:
     """Records the passes of a field that `decodes_on_device`."""
 
     def __init__(self, device: Device, config: FieldConfig) -> None:
         self.config = config
         self.weights = FieldWeights(device, config)
-        self.pool = BufferPool(device)
-        self.samples = SamplePasses(device, self.pool)
-        static, temporal = static_grid(config), temporal_grids(config)
-        self._groups = [_Group(HashEncoderPasses(device, [static], config.bound), slice(1), static.features)]
-        if temporal:
-            encoder = HashEncoderPasses(device, temporal, config.bound)
-            self._groups.append(_Group(encoder, slice(1, None), self.weights.temporal))
+        self._pool = BufferPool(device)
+        self._samples = SamplePasses(device, self._pool)
+        self._encoders = [HashEncoderPasses(device, [static_grid(config)], config.bound)]
+        if temporal := temporal_grids(config):
+            self._encoders.append(HashEncoderPasses(device, temporal, config.bound, first_table=1))
         self._decoder = DecoderPasses(device, self.weights)
         self._device = device
-
-    # Forward ---------------------------------------------------------------------------------------------------------
 
     def decode(
         self, commands: Commands, number: int, arrays: FieldArrays, t: Time, sampling: Sampling | None = None
     ) -> Decoding:
         """Record the forward pass of all Gaussians, or of samples, at a time of the field.
 
-        number: distinguishes the times that are submitted together, from 0 on.
+        number: distinguishes the times that are submitted together; 1 and 2 are those that `compare` takes.
         """
-        name = f"decoded {number}"
         points = self._points(commands, number, sampling, arrays, t)
         encodings = self._encode(commands, points, arrays.tables)
         beside = arrays.beside
         if sampling is not None:
-            beside = self.pool.array(f"beside {number}", (points.count, beside.shape[1]))
-            self.samples.rows(commands, f"set {number}", sampling, arrays.beside, beside, back=False)
-        heads = self.weights.heads_at(commands, arrays.weights, name, t)
+            beside = self._pool.array(f"beside {number}", (points.count, beside.shape[1]))
+            self._samples.rows(commands, f"set {number}", sampling, arrays.beside, beside, back=False)
+        heads = self.weights.heads_at(commands, arrays.weights, number, t)
         inputs = dict(zip(("beside", "static", "temporal"), [beside, *encodings], strict=False))
-        outputs = self.pool.array(f"outputs {number}", (points.count, self.weights.outputs))
-        self._decoder.decode(commands, inputs, arrays.weights, heads, outputs)
-        return Decoding(name, t, sampling, points, inputs, heads, outputs)
-
-    def compare(
-        self, commands: Commands, number: int, arrays: FieldArrays, t: Time, near: Sampling, near_time: Time
-    ) -> Comparison:
-        """Record the features of samples at a time, and of places near them at another time, and their differences.
-
-        number: as for `decode`; the next one is taken, too.
-        """
-
-        def at_means() -> Samples:
-            return replace(near(), reach=0.0)
-
-        points = (
-            self._points(commands, number, at_means, arrays, t),
-            self._points(commands, number + 1, near, arrays, near_time),
-        )
-        here, there = (self._encode(commands, each, arrays.tables) for each in points)
-        count = points[0].count
-        sums = []
-        kernel = Kernel.get(self._device, "smoothness")
-        for group, (a, b) in enumerate(zip(here, there, strict=True)):
-            total = self.pool.array(f"differences {group}", (count,))
-            uniform = self._smoothness(group, count, 0.0)
-            commands.dispatch(kernel, -(-count // 64), smoothness=uniform, here=a, there=b, sums=total)
-            sums.append(total)
-        return Comparison(points, here, there, sums)
-
-    # Backward --------------------------------------------------------------------------------------------------------
+        outputs = self._pool.array(f"outputs {number}", (points.count, self.weights.outputs))
+        decoding = Decoding(t, sampling, points, inputs, heads, outputs)
+        self._decoder.decode(commands, arrays.weights, decoding)
+        return decoding
 
     def decode_bwd(self, commands: Commands, decoding: Decoding, arrays: FieldArrays, gradients: FieldArrays) -> None:
         """Record the backward pass, from the outputs, which have become their gradient.
@@ -139,54 +73,60 @@ class GridFieldPasses:
         """
         d_beside = gradients.beside
         if decoding.sampling is not None:
-            d_beside = self.pool.array("d_beside", decoding.inputs["beside"].shape)
-        d_heads = self.weights.heads("gradient")
-        inputs, d_weights = decoding.inputs, gradients.weights
-        given = inputs, arrays.weights, decoding.heads, decoding.outputs
-        self._decoder.decode_bwd(commands, *given, inputs | {"beside": d_beside}, d_weights, d_heads)
+            d_beside = self._pool.array("d_beside", decoding.inputs["beside"].shape)
+        self._decoder.decode_bwd(commands, arrays.weights, decoding, d_beside, gradients.weights)
         if decoding.sampling is not None:
             number = decoding.points.number
-            self.samples.rows(commands, f"set {number}", decoding.sampling, gradients.beside, d_beside, back=True)
-        encodings = [array for name, array in inputs.items() if name != "beside"]
+            self._samples.rows(commands, f"set {number}", decoding.sampling, gradients.beside, d_beside, back=True)
+        encodings = [array for name, array in decoding.inputs.items() if name != "beside"]
         self._encode_bwd(commands, decoding.points, encodings, gradients.tables)
-        self.weights.heads_bwd(commands, arrays.weights, d_weights, d_heads, decoding.name, decoding.time)
 
-    def compare_bwd(
-        self, commands: Commands, comparison: Comparison, gradients: FieldArrays, weights: list[float]
-    ) -> None:
-        """Record the backward pass of differences. weights: of the sum of each group."""
-        count = comparison.points[0].count
-        kernel = Kernel.get(self._device, "smoothness_bwd")
-        for group, (here, there) in enumerate(zip(comparison.here, comparison.there, strict=True)):
-            uniform = self._smoothness(group, count, 2 * weights[group])
-            groups = -(-count * self._groups[group].features // 64)
-            commands.dispatch(kernel, groups, smoothness=uniform, here=here, there=there)
-        for points, encodings in zip(comparison.points, (comparison.here, comparison.there), strict=True):
-            self._encode_bwd(commands, points, encodings, gradients.tables)
+    def compare(
+        self,
+        commands: Commands,
+        arrays: FieldArrays,
+        gradients: FieldArrays,
+        near: Sampling,
+        times: tuple[Time, Time],
+        weights: Sequence[float],
+    ) -> list[DeviceArray]:
+        """Record the squared differences (count,) between the features of samples at a time and of places near them at
+        another time, for each group of grids; and the gradient of their weighted sums.
 
-    # Parts -----------------------------------------------------------------------------------------------------------
+        times: give both. weights: of the sum of each group.
+        """
+        means = self._points(commands, 1, lambda: replace(near(), reach=0.0), arrays, times[0])
+        places = self._points(commands, 2, near, arrays, times[1])
+        here, there = (self._encode(commands, points, arrays.tables) for points in (means, places))
+        forth, back = Kernel.get(self._device, "smoothness"), Kernel.get(self._device, "smoothness_bwd")
+        sums = []
+        for group, (a, b, weight) in enumerate(zip(here, there, weights, strict=False)):
+            (count, features), total = a.shape, self._pool.array(f"differences {group}", (means.count,))
+            content = forth.uniform("Smoothness", pairs=count, features=features, scale=2 * weight)
+            both = {"smoothness": self._pool.constant(content), "here": a, "there": b}
+            commands.dispatch(forth, -(-count // 64), sums=total, **both)
+            commands.dispatch(back, -(-a.size // 64), **both)
+            sums.append(total)
+        for points, d_encodings in ((means, here), (places, there)):
+            self._encode_bwd(commands, points, d_encodings, gradients.tables)
+        return sums
 
     def _points(
         self, commands: Commands, number: int, sampling: Sampling | None, arrays: FieldArrays, t: Time
     ) -> PointSet:
-        array = self.samples.places(commands, f"set {number}", sampling, arrays.geometry)
+        array = self._samples.places(commands, f"set {number}", sampling, arrays.geometry)
         return PointSet(number, array, array.shape[0], lambda: self.config.grid_time(t()))
 
     def _encode(self, commands: Commands, points: PointSet, tables: list[DeviceArray]) -> list[DeviceArray]:
         found = []
-        for number, (encoder, own, features) in enumerate(self._groups):
-            encoding = self.pool.array(f"encoding {points.number} {number}", (points.count, features))
-            encoder.encode(commands, points, tables[own], encoding)
+        for number, encoder in enumerate(self._encoders):
+            encoding = self._pool.array(f"encoding {points.number} {number}", (points.count, encoder.features))
+            encoder.encode(commands, points, tables, encoding)
             found.append(encoding)
         return found
 
     def _encode_bwd(
         self, commands: Commands, points: PointSet, d_encodings: list[DeviceArray], d_tables: list[DeviceArray]
     ) -> None:
-        for (encoder, own, _), d_encoding in zip(self._groups, d_encodings, strict=True):
-            encoder.add_gradient(commands, points, d_encoding, d_tables[own])
-
-    def _smoothness(self, group: int, pairs: int, scale: float) -> DeviceArray:
-        kernel = Kernel.get(self._device, "smoothness")
-        content = kernel.uniform("Smoothness", pairs=pairs, features=self._groups[group].features, scale=scale)
-        return self.pool.constant(content)
+        for encoder, d_encoding in zip(self._encoders, d_encodings, strict=True):
+            encoder.add_gradient(commands, points, d_encoding, d_tables)

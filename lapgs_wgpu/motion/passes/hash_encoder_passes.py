@@ -7,7 +7,7 @@ looking up two planes for each point.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +17,7 @@ from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import SOFTWARE_LOOP_TURNS, Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
-from lapgs_wgpu.motion.fields.hash_grid_config import TIME, GridShape
+from lapgs_wgpu.motion.fields.hash_grid_config import GridShape
 
 _ALIGNED = 64  # rows; a multiple of 256 bytes for every row size, at which a binding may begin
 _LEVEL_WORDS = 16  # common/hashgrid.wgsl: struct Level
@@ -39,24 +39,20 @@ class PointSet:
 
 @dataclass(frozen=True)
 class _Levels:
-    """Levels that one dispatch takes. name: distinguishes them. cells: of the largest level's plane."""
+    """Levels that one dispatch takes. cells: of the largest level's plane."""
 
-    name: str
-    sliced: bool
+    defines: dict[str, int]
     count: int
     cells: int
     array: DeviceArray
-
-    @property
-    def defines(self) -> dict[str, int]:
-        return {"SLICED": 1, "CORNERS": 4} if self.sliced else {"CORNERS": 8}
 
 
 class HashEncoderPasses:
     """Records the passes that encode points with several grids. Axes and levels are fixed.
 
-    lane_levels: use the shape for CPU devices: in the backward pass a lane owns a level, in the others it takes
-    many points or cells; otherwise the shape for GPUs, with fixed-point atomics.
+    On CPU devices, a lane owns a level in the backward pass and takes many points or cells in the others; on GPUs it
+    owns few, with fixed-point atomics.
+    first_table: number of the first grid's table among those that are given with each call.
     row, column: the encoding's rows have `row` floats; the grids' features are written one after another from `column`
     on. Both are even. By default the rows hold the features only.
     """
@@ -67,84 +63,74 @@ class HashEncoderPasses:
         grids: Sequence[GridShape],
         bound: float,
         *,
-        lane_levels: bool | None = None,
+        first_table: int = 0,
         row: int | None = None,
         column: int = 0,
     ) -> None:
-        self.device, self.grids, self.bound = device, list(grids), bound
-        self.pool = BufferPool(device)
-        self.lane_levels = device.is_cpu if lane_levels is None else lane_levels
-        self._long_lanes = {"LONG_LANES": 1} if self.lane_levels else {}
-        self._group_points, self._group_cells = (2048, 1024) if self.lane_levels else (512, 64)
-        # If a lane loops over all points: at most half of the iterations that the driver allows.
-        turns = SOFTWARE_LOOP_TURNS if self.lane_levels else None
-        self._most_points = None if turns is None else (turns + 1) // 2
-        self._row = sum(grid.features for grid in grids) if row is None else row
-        self._timed = any(grid.axes[2] == TIME for grid in grids)
-        self._cuts: dict[int, _Levels] = {}  # by grid: the levels that are sliced
-        self._direct: dict[int, _Levels] = {}  # by grid: the others
+        self.features = sum(grid.features for grid in grids)
+        self._device, self._bound, self._pool = device, bound, BufferPool(device)
+        self._lane_levels = device.is_cpu
+        self._group_points, self._group_cells = (2048, 1024) if self._lane_levels else (512, 64)
+        self._row = self.features if row is None else row
+        self._cuts: dict[int, _Levels] = {}  # by table: the levels that are sliced
+        self._direct: dict[int, _Levels] = {}  # by table: the others
         self._slices: _Levels | None = None  # those that are sliced, of all grids
         self._slice_entries = 0
         of_slices: list[NDArray[np.uint32]] = []
-        for number, grid in enumerate(grids):
+        for number, grid in enumerate(grids, first_table):
             words = _level_words(grid, column // 2, self._slice_entries)
             sliced = np.isin(np.arange(len(words)), grid.sliced)
             if sliced.any():
-                self._cuts[number] = self._levels(f"cut {number}", True, words[sliced])
+                self._cuts[number] = self._levels(words[sliced], sliced=True)
                 of_slices.append(words[sliced])
             if not sliced.all():
-                self._direct[number] = self._levels(f"direct {number}", False, words[~sliced])
+                self._direct[number] = self._levels(words[~sliced], sliced=False)
             self._slice_entries += int(words[sliced, 4:6].prod(axis=1).sum())
             column += grid.features
         if of_slices:
-            self._slices = self._levels("slices", True, np.concatenate(of_slices))
+            self._slices = self._levels(np.concatenate(of_slices), sliced=True)
 
-    def _levels(self, name: str, sliced: bool, words: NDArray[np.uint32]) -> _Levels:
-        array = DeviceArray.upload(self.device, f"levels {name}", words)
-        return _Levels(name, sliced, len(words), int(words[:, 4:6].prod(axis=1).max()), array)
+    def _levels(self, words: NDArray[np.uint32], *, sliced: bool) -> _Levels:
+        array = DeviceArray.upload(self._device, "levels", words)
+        defines = {"SLICED": 1, "CORNERS": 4} if sliced else {"CORNERS": 8}
+        return _Levels(defines, len(words), int(words[:, 4:6].prod(axis=1).max()), array)
 
     def _lookups(self, slices: DeviceArray, tables: Sequence[DeviceArray]) -> list[tuple[_Levels, DeviceArray]]:
         """Return the levels of each lookup, with what they are looked up in, or with its gradient."""
         direct = [(levels, tables[number]) for number, levels in self._direct.items()]
         return direct if self._slices is None else [(self._slices, slices), *direct]
 
-    def _uniform(self, points: PointSet, first: int, count: int, most: int) -> DeviceArray:
-        """Return the uniform of a block of points, of at most so many (0: of all). All blocks of all sets are submitted
-        together, so each has its own."""
-        kernel, name = Kernel.get(self.device, "hashgrid_slice"), f"grid {points.number} from {first} by {most}"
-        sizes = {"points": count, "all_points": points.count, "all_levels": self._row // 2}
-        if not self._timed:
-            return self.pool.constant(kernel.uniform("Grid", time=0.0, bound=self.bound, **sizes))
-        return self.pool.varying(name, lambda: kernel.uniform("Grid", time=points.time(), bound=self.bound, **sizes))
+    def _uniform(self, points: PointSet, first: int, count: int) -> DeviceArray:
+        """Return the uniform of a block; each has its own, since all blocks of all sets are submitted together."""
+        kernel = Kernel.get(self._device, "hashgrid_slice")
+        sizes = {"points": count, "all_points": points.count, "all_levels": self._row // 2, "bound": self._bound}
+        name = f"grid {points.number} from {first}"
+        return self._pool.varying(name, lambda: kernel.uniform("Grid", time=points.time(), **sizes))
 
-    def _blocks(
-        self, points: PointSet, encoding: DeviceArray, most: int | None = None
-    ) -> Iterator[tuple[int, int, DeviceArray]]:
-        """Yield first point, number of points and uniform of each dispatch: at most `most` points, whose rows fit in a
-        binding."""
-        n = points.count
-        row = encoding.nbytes // max(n, 1)
-        size = self.device.max_binding // max(row, 1) // _ALIGNED * _ALIGNED
-        size = size if most is None else min(size, most)
-        counts = ((first, min(size, n - first)) for first in range(0, n, size))
-        for first, count in counts:
-            yield first, count, self._uniform(points, first, count, size)
+    def _blocks(self, points: PointSet) -> list[tuple[int, int, DeviceArray]]:
+        """Return first point, number of points and uniform of each dispatch: as many as fit in a binding, and where a
+        lane loops over all of them, at most half of the iterations that the driver allows."""
+        size = self._device.max_binding // max(4 * self._row, 1) // _ALIGNED * _ALIGNED
+        if self._lane_levels:
+            size = min(size, (SOFTWARE_LOOP_TURNS + 1) // 2)
+        counts = [(first, min(size, points.count - first)) for first in range(0, points.count, size)]
+        return [(first, count, self._uniform(points, first, count)) for first, count in counts]
 
     def encode(self, commands: Commands, points: PointSet, tables: list[DeviceArray], encoding: DeviceArray) -> None:
         """Encode points; outside the box [-bound, bound]^3 features are zero.
 
         tables: (entries, 2) of each grid. encoding: (N, row) float32, N = points.count.
         """
-        blocks = list(self._blocks(points, encoding))
-        slices = self.pool.array("slices", (self._slice_entries, 2))
-        for number, cut in self._cuts.items():
-            kernel = Kernel.get(self.device, "hashgrid_slice", **self._long_lanes)
+        blocks = self._blocks(points)
+        slices = self._pool.array("slices", (self._slice_entries, 2))
+        for number, cut in self._cuts.items() if blocks else ():
+            kernel = Kernel.get(self._device, "hashgrid_slice", LONG_LANES=self._lane_levels)
             arrays = {"levels": cut.array, "features": tables[number], "slices": slices, "grid": blocks[0][2]}
             commands.dispatch_grid(kernel, (-(-cut.cells // self._group_cells), cut.count), **arrays)
         for first, count, grid in blocks:
             arrays = {"points": points.array.rows(first, count), "encoding": encoding.rows(first, count), "grid": grid}
             for levels, features in self._lookups(slices, tables):
-                kernel = Kernel.get(self.device, "hashgrid", **levels.defines, **self._long_lanes)
+                kernel = Kernel.get(self._device, "hashgrid", **levels.defines, LONG_LANES=self._lane_levels)
                 groups = -(-count // self._group_points) * levels.count
                 commands.dispatch(kernel, groups, levels=levels.array, features=features, **arrays)
 
@@ -152,41 +138,39 @@ class HashEncoderPasses:
         self, commands: Commands, points: PointSet, d_encoding: DeviceArray, d_tables: list[DeviceArray]
     ) -> None:
         """Add the gradient of the tables, from that of the encoding, whose rows must hold nothing else."""
-        d_slices = self.pool.array("d_slices", (self._slice_entries, 2))
+        if not points.count:
+            return
+        d_slices, blocks = self._pool.array("d_slices", (self._slice_entries, 2)), self._blocks(points)
         commands.clear(d_slices)
         sums = floats = self._lookups(d_slices, d_tables)
-        if not self.lane_levels:
-            sums = [
-                (levels, self.pool.array(f"d_fixed {levels.name}", (2 * target.size,), "uint32"))
-                for levels, target in floats
-            ]
-
-        largest = {} if self.lane_levels else {"largest": self._largest(commands, points, d_encoding)}
-        for first, count, grid in self._blocks(points, d_encoding, self._most_points):
+        of_all: dict[str, DeviceArray] = {"grid": blocks[0][2]}
+        if not self._lane_levels:
+            named = enumerate(floats)
+            sums = [(of, self._pool.array(f"d_fixed {i}", (2 * d.size,), "uint32")) for i, (of, d) in named]
+            of_all["largest"] = self._largest(commands, points, d_encoding)
+        for first, count, grid in blocks:
             arrays = {"points": points.array.rows(first, count), "d_encoding": d_encoding.rows(first, count)}
-            arrays |= {"grid": grid, **largest}
             for levels, target in sums:
-                kernel = Kernel.get(self.device, "hashgrid_bwd", **levels.defines, LANE_LEVELS=self.lane_levels)
-                groups = _shared(levels.count) if self.lane_levels else -(-count // 64) * levels.count
-                commands.run(kernel, groups, arrays | {"levels": levels.array, "d_features": target, "d_fixed": target})
+                kernel = Kernel.get(self._device, "hashgrid_bwd", **levels.defines, LANE_LEVELS=self._lane_levels)
+                groups = _shared(levels.count) if self._lane_levels else -(-count // 64) * levels.count
+                arrays |= {"levels": levels.array, "d_features": target, "d_fixed": target}
+                commands.run(kernel, groups, of_all | arrays | {"grid": grid})
                 commands.flush()  # all lookups together may take longer than a watchdog allows
-
-        if not self.lane_levels:
+        if not self._lane_levels:
+            unfix = Kernel.get(self._device, "hashgrid_unfix")
             for (_, target), (_, fixed) in zip(floats, sums, strict=True):
-                unfix = Kernel.get(self.device, "hashgrid_unfix")
-                groups = -(-target.size // 64)
-                commands.dispatch(unfix, groups, grid=grid, d_fixed=fixed, d_features=target, **largest)
+                commands.dispatch(unfix, -(-target.size // 64), d_fixed=fixed, d_features=target, **of_all)
         for number, cut in self._cuts.items():
-            kernel = Kernel.get(self.device, "hashgrid_slice_bwd", **self._long_lanes)
-            arrays = {"levels": cut.array, "d_slices": d_slices, "d_features": d_tables[number], "grid": grid}
+            kernel = Kernel.get(self._device, "hashgrid_slice_bwd", LONG_LANES=self._lane_levels)
+            arrays = {"levels": cut.array, "d_slices": d_slices, "d_features": d_tables[number], "grid": blocks[0][2]}
             commands.dispatch_grid(kernel, (-(-cut.cells // self._group_cells), cut.count), **arrays)
 
     def _largest(self, commands: Commands, points: PointSet, d_encoding: DeviceArray) -> DeviceArray:
         """Return the largest absolute value of a gradient, which scales fixed-point sums."""
-        largest = self.pool.array(f"largest {points.number}", (1,), "uint32")
+        largest = self._pool.array(f"largest {points.number}", (1,), "uint32")
         commands.clear(largest)
-        kernel = Kernel.get(self.device, "hashgrid_largest")
-        for first, count, grid in self._blocks(points, d_encoding):
+        kernel = Kernel.get(self._device, "hashgrid_largest")
+        for first, count, grid in self._blocks(points):
             gradient = d_encoding.rows(first, count)
             commands.dispatch(kernel, -(-count * self._row // 4096), grid=grid, d_encoding=gradient, largest=largest)
         return largest

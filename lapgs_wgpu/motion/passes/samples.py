@@ -29,10 +29,6 @@ class Samples:
         """Half of the bits that number the Gaussians, rounded up."""
         return -(-(self.gaussians - 1).bit_length() // 2)
 
-    def uniform(self, kernel: Kernel) -> bytes:
-        """The content of the struct Samples of a kernel that has it."""
-        return kernel.uniform("Samples", half_bits=self.half_bits, **vars(self))
-
 
 Sampling = Callable[[], Samples]  # gives the samples of the step that is taken, whose number is the same in each
 
@@ -49,32 +45,30 @@ class SamplePasses:
 
         geometry: (N, 12), as common/geometry.wgsl has it.
         """
-        every, n = sampling is None, geometry.shape[0]
+        sampled, n = sampling is not None, geometry.shape[0]
         sampling = sampling or partial(Samples, n, n)
         samples = sampling()
         points = self._pool.array(f"points {name}", (samples.count, 4))
-        kernel = Kernel.get(self._device, "place_points", SAMPLED=not every, OFFSET=samples.reach > 0)
-        uniform = self.uniform(name, sampling)
-        groups = -(-samples.count // 64)
-        commands.dispatch(kernel, groups, samples=uniform, geometry=geometry, points=points)
+        kernel = Kernel.get(self._device, "place_points", SAMPLED=sampled, OFFSET=samples.reach > 0)
+        arrays = {"samples": self.uniform(name, sampling), "geometry": geometry, "points": points}
+        commands.dispatch(kernel, -(-samples.count // 64), **arrays)
         return points
 
     def rows(
         self, commands: Commands, name: str, sampling: Sampling, every: DeviceArray, chosen: DeviceArray, *, back: bool
     ) -> None:
         """The sampled rows of an array (N, C), copied to (count, C), or with `back` added from there."""
-        columns = every.shape[1]
         kernel = Kernel.get(self._device, "sample_rows", BACK=back)
-        commands.dispatch(
-            kernel,
-            -(-chosen.size // 64),
-            samples=self.uniform(name, sampling),
-            row=self._pool.constant(kernel.uniform("Row", columns=columns)),
-            chosen=chosen,
-            all=every,
-        )
+        row = self._pool.constant(kernel.uniform("Row", columns=every.shape[1]))
+        arrays = {"samples": self.uniform(name, sampling), "row": row, "chosen": chosen, "all": every}
+        commands.dispatch(kernel, -(-chosen.size // 64), **arrays)
 
     def uniform(self, name: str, sampling: Sampling) -> DeviceArray:
         """The uniform of the samples."""
         kernel = Kernel.get(self._device, "place_points")
-        return self._pool.varying(f"samples {name}", lambda: sampling().uniform(kernel))
+
+        def write() -> bytes:
+            samples = sampling()
+            return kernel.uniform("Samples", half_bits=samples.half_bits, **vars(samples))
+
+        return self._pool.varying(f"samples {name}", write)

@@ -30,28 +30,6 @@ _BLOCK_BYTES = 128 << 20  # of the features that a dispatch reads: WebGPU's defa
 _PLACES = np.array([*range(4), 8, 9, 10, *range(4, 8), 12, 13, 14, 16, 17, 18, 11])
 
 
-def runs_on_device(config: FieldConfig, device: Device) -> bool:
-    """Return whether `GridFieldPlayback` supports this field on the device."""
-    if not config.decodes_on_device or device.max_loop_turns is None:
-        return config.decodes_on_device
-    sizes = _Sizes(config)
-    # Iterations of a round of 8 channels (on CPU devices), with the loops over channels and the round itself.
-    return (sizes.width // 8 + 1) * (sizes.still_quads + sizes.moving_quads + 11) < device.max_loop_turns
-
-
-class _Sizes:
-    """Lengths of the rows that the pass reads, in floats and in quads of four floats."""
-
-    def __init__(self, config: FieldConfig) -> None:
-        self.width = config.width
-        self.static = static_grid(config).features
-        self.dynamics = config.dynamics_size
-        self.temporal = sum(grid.features for grid in temporal_grids(config))
-        self.first_temporal = self.dynamics + self.dynamics % 2  # features come in pairs
-        self.still_quads = -(-self.static // 4)
-        self.moving_quads = -(-(self.first_temporal + self.temporal) // 4)
-
-
 @dataclass(frozen=True)
 class _Block:
     """The range of Gaussians of one dispatch, and its inputs."""
@@ -64,42 +42,35 @@ class _Block:
 
 
 class GridFieldPlayback:
-    """Moves Gaussians by a field.
+    """Moves Gaussians by a field that `decodes_on_device`.
 
     parameters: of the field, by the names and in the shapes of fields/parameter_shapes. gaussians: activated, but with
-    opacity_logits, and with quats of unit length. block: number of Gaussians per dispatch, a multiple of 64; by default
-    as many as fit into 128 MiB. Gaussians with static_features (N, F) need no static table.
+    opacity_logits, and with quats of unit length. Gaussians with static_features (N, F) need no static table.
     """
 
     def __init__(
-        self,
-        device: Device,
-        config: FieldConfig,
-        parameters: Mapping[str, Floats],
-        gaussians: Mapping[str, Floats],
-        *,
-        block: int | None = None,
+        self, device: Device, config: FieldConfig, parameters: Mapping[str, Floats], gaussians: Mapping[str, Floats]
     ) -> None:
         self._device, self._config = device, config
         self._parameters = {name: array for name, array in parameters.items() if not name.endswith(".table")}
         self._pool = BufferPool(device)
-        self._sizes = sizes = _Sizes(config)
         self._defines = {"POINTS": 4, "QUADS": 2} if device.is_cpu else {"POINTS": 2, "QUADS": 1}
         self._defines["HEADS"] = 5 if config.appearance_size else 4
         self._motion_heads = 4 if config.kind == "laplacian" else 0
         self._channels = 4 * self._defines["QUADS"]  # a round
         self._rounds = -(-config.width // self._channels)
-        row = max(_CANONICAL + 4 * sizes.still_quads, 4 * sizes.moving_quads)
-        size = block or _BLOCK_BYTES // (4 * row) // _LANES * _LANES
-        count = len(gaussians["means"])
+        grids, self._static = temporal_grids(config), static_grid(config).features
+        self._first_temporal = config.dynamics_size + config.dynamics_size % 2  # features come in pairs
+        # Lengths of the rows that the pass reads, in quads of four floats.
+        self._still_quads = -(-self._static // 4)
+        self._moving_quads = -(-(self._first_temporal + sum(grid.features for grid in grids)) // 4)
+        row = max(_CANONICAL + 4 * self._still_quads, 4 * self._moving_quads)
+        size, count = _BLOCK_BYTES // (4 * row) // _LANES * _LANES, len(gaussians["means"])
         self._blocks = [self._block(gaussians, first, min(size, count - first)) for first in range(0, count, size)]
-        self._temporal = HashEncoderPasses(
-            device, temporal_grids(config), config.bound, row=4 * sizes.moving_quads, column=sizes.first_temporal
-        )
-        self._tables = [
-            self._pool.upload(f"table {i}", parameters[f"temporal_grids.{i}.table"])
-            for i in range(len(self._temporal.grids))
-        ]
+        row = 4 * self._moving_quads
+        self._temporal = HashEncoderPasses(device, grids, config.bound, row=row, column=self._first_temporal)
+        names = [f"temporal_grids.{i}.table" for i in range(len(grids))]
+        self._tables = [self._pool.upload(name, parameters[name]) for name in names]
         if "static_features" not in gaussians:
             self._encode_static(parameters["static_grid.table"])
         heads = self._heads(0.0)
@@ -110,23 +81,21 @@ class GridFieldPlayback:
         g = {name: array[first : first + count] for name, array in gaussians.items()}
         points = np.zeros((count, 4), np.float32)
         points[:, :3] = g["means"]
-        still = np.zeros((count, _CANONICAL + 4 * self._sizes.still_quads), np.float32)
+        still = np.zeros((count, _CANONICAL + 4 * self._still_quads), np.float32)
         still[:, :3], still[:, 3], still[:, 4:8] = g["means"], g["opacity_logits"], g["quats"]
-        still[:, 8:11], still[:, 12:15] = g["scales"], g["colors"][:, 0]
+        still[:, 8:11], still[:, 12:15] = g["scales"], g["sh"][:, 0]
         still[:, 11] = self._config.negative_scales == "mirror"
         if "static_features" in g:
-            still[:, _CANONICAL : _CANONICAL + self._sizes.static] = g["static_features"]
-        moving = np.zeros((count, max(4, 4 * self._sizes.moving_quads)), np.float32)
-        if self._sizes.dynamics:
-            moving[:, : self._sizes.dynamics] = g["dynamics"]
+            still[:, _CANONICAL : _CANONICAL + self._static] = g["static_features"]
+        moving = np.zeros((count, max(4, 4 * self._moving_quads)), np.float32)
+        if self._config.dynamics_size:
+            moving[:, : self._config.dynamics_size] = g["dynamics"]
         named = {"points": points, "still": still, "moving": moving}
         return _Block(first, count, **{name: self._pool.upload(f"{name} from {first}", a) for name, a in named.items()})
 
     def _encode_static(self, entries: Floats) -> None:
-        row = _CANONICAL + 4 * self._sizes.still_quads
-        encoder = HashEncoderPasses(
-            self._device, [static_grid(self._config)], self._config.bound, row=row, column=_CANONICAL
-        )
+        grid, row = static_grid(self._config), _CANONICAL + 4 * self._still_quads
+        encoder = HashEncoderPasses(self._device, [grid], self._config.bound, row=row, column=_CANONICAL)
         table = DeviceArray.upload(self._device, "static table", entries)  # not in the pool, since it is needed once
         with Commands(self._device) as commands:
             for number, block in enumerate(self._blocks):
@@ -134,7 +103,7 @@ class GridFieldPlayback:
 
     def static_features(self) -> Floats:
         """Return the spatial features H_s, (N, F): the static grid's at the canonical means."""
-        parts = [block.still.read()[:, _CANONICAL : _CANONICAL + self._sizes.static] for block in self._blocks]
+        parts = [block.still.read()[:, _CANONICAL : _CANONICAL + self._static] for block in self._blocks]
         return np.concatenate(parts)
 
     # Weights ---------------------------------------------------------------------------------------------------------
@@ -147,22 +116,22 @@ class GridFieldPlayback:
 
     def _stream(self) -> Floats:
         """Return the vectors (V, 4) of biases and layers of the decoder, in the order in which the pass reads them."""
-        p, sizes, rounds = self._parameters, self._sizes, self._rounds
+        p, dynamics, rounds = self._parameters, self._config.dynamics_size, self._rounds
         p = p | {name: np.float32(0.5) * p[name] for name in ("spatial.weight", "spatial.bias")}  # see common/gate.wgsl
-        moving = np.zeros((sizes.width, sizes.first_temporal + sizes.temporal), np.float32)
-        moving[:, : sizes.dynamics] = p["temporal.weight"][:, : sizes.dynamics]
-        moving[:, sizes.first_temporal :] = p["temporal.weight"][:, sizes.dynamics : sizes.dynamics + sizes.temporal]
+        moving = p["temporal.weight"][:, : None if self._tables else dynamics]  # a layer without inputs has one column
+        if dynamics % 2:
+            moving = np.insert(moving, dynamics, 0, axis=1)
         still, biases = ["spatial"], ["spatial", "temporal"]
         if self._config.kind == "laplacian":
             still, biases = [*still, "motion.first"], [*biases, "motion.first"]
         starts = np.concatenate([self._columns(p[f"{name}.bias"][:, None], 1)[:, 0, :, :1] for name in biases], axis=2)
-        layers = [self._columns(p[f"{name}.weight"], sizes.still_quads) for name in still]
-        parts = [starts, np.stack(layers, axis=4), self._columns(moving, sizes.moving_quads)]
+        layers = [self._columns(p[f"{name}.weight"], self._still_quads) for name in still]
+        parts = [starts, np.stack(layers, axis=4), self._columns(moving, self._moving_quads)]
         return np.concatenate([part.reshape(rounds, -1, 4) for part in parts], axis=1).reshape(-1, 4)
 
     def _heads(self, t: float) -> Floats:
         """Return the vectors (V, 4) of the heads: biases, and weights by channel; the Laplacian motion is folded in."""
-        p, width, heads = self._parameters, self._sizes.width, self._defines["HEADS"]
+        p, width, heads = self._parameters, self._config.width, self._defines["HEADS"]
         names = ["heads", "appearance"] if self._config.appearance_size else ["heads"]
         factors = np.array(self._config.head_factors, np.float32)
         weight = np.concatenate([p[f"{name}.weight"] for name in names]) * factors[:, None]
@@ -191,30 +160,15 @@ class GridFieldPlayback:
         kernel = Kernel.get(self._device, "deform", MOTION=self._motion_heads > 0, COLOR=color, **self._defines)
         heads = self._heads(t)
         self._weights.rows(0, len(heads)).write(heads)
-        names = {"means": "means", "quats": "quats", "scales": "scales", "opacities": "opacities"}
-        names |= {"colors": "sh"} if color else {}
+        sizes = {"rounds": self._rounds, "still_quads": self._still_quads, "moving_quads": self._moving_quads}
+        sizes |= {"stream": self._stream_at, "sh_stored": out.sh.shape[1]}
         with Commands(self._device) as commands:
             for number, block in enumerate(self._blocks):
                 points = PointSet(number, block.points, block.count, partial(self._config.grid_time, t))
                 self._temporal.encode(commands, points, self._tables, block.moving)
-                uniform = self._pool.constant(
-                    kernel.uniform(
-                        "Deform",
-                        gaussians=block.count,
-                        rounds=self._rounds,
-                        still_quads=self._sizes.still_quads,
-                        moving_quads=self._sizes.moving_quads,
-                        stream=self._stream_at,
-                        sh_stored=out.sh.shape[1],
-                    ),
-                )
-                commands.dispatch(
-                    kernel,
-                    -(-block.count // (_LANES * self._defines["POINTS"])),
-                    deform=uniform,
-                    still=block.still,
-                    moving=block.moving,
-                    weights=self._weights,
-                    **{name: getattr(out, of).rows(block.first, block.count) for name, of in names.items()},
-                )
+                arrays = {name: array.rows(block.first, block.count) for name, array in out.arrays().items()}
+                arrays |= {"colors": arrays["sh"], "still": block.still, "moving": block.moving}
+                arrays["deform"] = self._pool.constant(kernel.uniform("Deform", gaussians=block.count, **sizes))
+                arrays["weights"] = self._weights
+                commands.run(kernel, -(-block.count // (_LANES * self._defines["POINTS"])), arrays)
                 commands.flush()  # all blocks together may take longer than a watchdog allows

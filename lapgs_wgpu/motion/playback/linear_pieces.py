@@ -20,7 +20,7 @@ from lapgs_wgpu.splat.constants import CONSTANTS
 
 Floats = NDArray[np.floating]
 
-SAMPLES = 128  # of the clip at least; a field's spectrum has up to 16 cycles
+_SAMPLES = 128  # of the clip at least; a field's spectrum has up to 16 cycles
 _PIECE_SAMPLES = 8  # of a piece at least
 _SHORTEST = 2.0**-9  # of the clip: shorter pieces are not halved
 _BLOCK = 1 << 21  # samples at once: 0.1 GB
@@ -55,12 +55,32 @@ def linear_pieces(playback: Playback, farthest: float, shade: float, done: Calla
     playback has it, world units. shade: largest change of opacity and color within a piece, both in [0, 1]. done:
     called with the share that is done, now and then.
     """
+
+    def halve(values: Floats, rows: NDArray[np.integer], begin: float, end: float) -> Iterator[tuple[Floats, ...]]:
+        """Yield (source, begin, end, state at the middle, slope) of pieces. values: (samples, rows, 13), evenly."""
+        at = np.linspace(-0.5, 0.5, len(values), dtype=np.float32)[:, None, None]
+        middle = values.mean(axis=0)
+        slope = (at * values[..., _MEAN]).sum(axis=0) / (at**2).sum()
+        guess = np.broadcast_to(middle, values.shape).copy()
+        guess[..., _MEAN] += at * slope
+        near = (displacement(guess, values) <= farthest).all(axis=0)
+        near &= (np.abs(guess - values)[..., _REST] <= shade).all(axis=(0, 2))
+        near |= end - begin <= _SHORTEST
+        seen = near & (values[..., 9].max(axis=0) >= CONSTANTS["ALPHA_MIN"])
+        count = int(seen.sum())
+        yield rows[seen], np.full(count, begin), np.full(count, end), middle[seen], slope[seen] / (end - begin)
+        if near.all():
+            return
+        values, rows, half, cut = values[:, ~near], rows[~near], len(values) // 2, 0.5 * (begin + end)
+        for part, span in ((values[: half + 1], (begin, cut)), (values[half:], (cut, end))):
+            yield from halve(_sampled(playback, part, rows, *span), rows, *span)
+
     found: list[tuple[Floats, ...]] = []
-    size = _BLOCK // SAMPLES
+    size = _BLOCK // _SAMPLES
     for first in range(0, playback.count, size):
         block = np.arange(first, min(first + size, playback.count))
-        values = np.stack([state(playback, t, block) for t in np.linspace(0, 1, SAMPLES + 1).tolist()])
-        for piece in _halve(playback, values, block, 0.0, 1.0, farthest, shade):
+        values = np.stack([state(playback, t, block) for t in np.linspace(0, 1, _SAMPLES + 1).tolist()])
+        for piece in halve(values, block, 0.0, 1.0):
             found.append(piece)
             done((first + len(block) * float(piece[1].max(initial=0))) / playback.count)
     source, begin, end, middle, slopes = (np.concatenate(each) for each in zip(*found, strict=True))
@@ -75,8 +95,7 @@ def linear_pieces(playback: Playback, farthest: float, shade: float, done: Calla
 
 def state(playback: Playback, t: float, rows: NDArray[np.integer]) -> Floats:
     """Return states (rows, 13) of Gaussians at a time: mean, root of the covariance, opacity, color of degree 0."""
-    now = playback.at(t)
-    arrays = read_all([now.means, now.quats, now.scales, now.opacities, now.sh])
+    arrays = read_all(list(playback.at(t).arrays().values()))
     means, quats, scales, opacities, sh = (values[rows] for values in arrays)
     roots = roots_of(scales, np.roll(quats, -1, axis=1))
     return np.concatenate([means, roots, opacities[:, None], CONSTANTS["SH_C0"] * sh[:, 0]], axis=1)
@@ -94,6 +113,16 @@ def displacement(moved: Floats, true: Floats) -> Floats:
     return means + np.linalg.norm(moved[..., _ROOT] - true[..., _ROOT], axis=-1)
 
 
+def _sampled(playback: Playback, values: Floats, rows: NDArray[np.integer], begin: float, end: float) -> Floats:
+    """Return the samples of a piece, with those in between where they are too few."""
+    if len(values) > _PIECE_SAMPLES:
+        return values
+    fine = np.empty((2 * len(values) - 1, *values.shape[1:]), values.dtype)
+    fine[::2] = values
+    fine[1::2] = [state(playback, t, rows) for t in np.linspace(begin, end, len(fine))[1::2].tolist()]
+    return fine
+
+
 def _ellipsoids(roots: Floats) -> tuple[Floats, Floats]:
     """Return scales (N, 3) and quaternions (N, 4) xyzw of roots."""
     from scipy.spatial.transform import Rotation
@@ -103,44 +132,3 @@ def _ellipsoids(roots: Floats) -> tuple[Floats, Floats]:
     scales, axes = np.linalg.eigh(matrices)
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
     return np.maximum(scales, CONSTANTS["MIN_SCALE"]), Rotation.from_matrix(axes).as_quat()
-
-
-def _halve(
-    playback: Playback,
-    values: Floats,
-    rows: NDArray[np.integer],
-    begin: float,
-    end: float,
-    farthest: float,
-    shade: float,
-) -> Iterator[tuple[Floats, ...]]:
-    """Yield (source, begin, end, state at the middle, slope) of pieces. values: (samples, rows, 13), evenly."""
-    at = np.linspace(-0.5, 0.5, len(values), dtype=np.float32)[:, None, None]
-    middle = values.mean(axis=0)
-    slope = (at * values[..., _MEAN]).sum(axis=0) / (at**2).sum()
-    guess = np.broadcast_to(middle, values.shape).copy()
-    guess[..., _MEAN] += at * slope
-    near = (displacement(guess, values) <= farthest).all(axis=0)
-    near &= (np.abs(guess - values)[..., _REST] <= shade).all(axis=(0, 2))
-    near |= end - begin <= _SHORTEST
-    seen = near & (values[..., 9].max(axis=0) >= CONSTANTS["ALPHA_MIN"])
-    count = int(seen.sum())
-    yield rows[seen], np.full(count, begin), np.full(count, end), middle[seen], slope[seen] / (end - begin)
-    if near.all():
-        return
-    values, rows, half = values[:, ~near], rows[~near], len(values) // 2
-    cut = 0.5 * (begin + end)
-    for part, (first, last) in ((values[: half + 1], (begin, cut)), (values[half:], (cut, end))):
-        yield from _halve(playback, _sampled(playback, part, rows, first, last), rows, first, last, farthest, shade)
-
-
-def _sampled(playback: Playback, values: Floats, rows: NDArray[np.integer], begin: float, end: float) -> Floats:
-    """Return the samples of a piece, with those in between where they are too few."""
-    if len(values) > _PIECE_SAMPLES:
-        return values
-    fine = np.empty((2 * len(values) - 1, *values.shape[1:]), values.dtype)
-    fine[::2] = values
-    for number, t in enumerate(np.linspace(begin, end, len(fine)).tolist()):
-        if number % 2:
-            fine[number] = state(playback, t, rows)
-    return fine

@@ -15,7 +15,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.io.ply import GaussianSnapshot
 from lapgs_wgpu.motion.fields.config import MIN_SCALE
-from lapgs_wgpu.motion.playback.grid_field_playback import GridFieldPlayback, runs_on_device
+from lapgs_wgpu.motion.playback.grid_field_playback import GridFieldPlayback
 from lapgs_wgpu.motion.scene_file import SceneFile
 from lapgs_wgpu.splat.gaussians import Gaussians
 
@@ -46,11 +46,10 @@ class Playback(Protocol):
 def playback_of(file: SceneFile, device: Device) -> Playback:
     """Playback of a file that was read.
 
-    torch is imported only for the fields mlp and hexplane, for hidden layers, and for the ablation of the motion.
     Raises MemoryError if a buffer of all Gaussians exceeds the device's limits. The colors are the largest one: 1.4
     million Gaussians of degree 3 at WebGPU's default limits.
     """
-    if file.field_config.kind == "static" or runs_on_device(file.field_config, device):
+    if file.field_config.kind == "static" or file.field_config.decodes_on_device:
         return DevicePlayback(file, device)
     from lapgs_wgpu.motion.playback.torch_playback import TorchPlayback
     from lapgs_wgpu.motion.scene import scene_of
@@ -67,8 +66,7 @@ class DevicePlayback:
         self.moves = file.field_config.kind != "static"
         activated = activate(file.gaussians, file.sh_degree)
         pool = BufferPool(device)
-        names = {"means": "means", "quats": "quats", "scales": "scales", "opacities": "opacities", "sh": "colors"}
-        arrays = {name: pool.upload(name, activated[of]) for name, of in names.items()}
+        arrays = {name: pool.upload(name, activated[name]) for name in ("means", "quats", "scales", "opacities", "sh")}
         self._now = Gaussians(**arrays, antialiased=file.antialiased)
         self._field: GridFieldPlayback | None = None
         self._time: float | None = None  # of the Gaussians in the buffers, where a field moves them
@@ -87,8 +85,7 @@ class DevicePlayback:
         return self._field.static_features() if self._field else None
 
     def snapshot(self, t: float) -> GaussianSnapshot:
-        now = self.at(t)
-        means, quats, scales, opacities, colors = read_all([now.means, now.quats, now.scales, now.opacities, now.sh])
+        means, quats, scales, opacities, colors = read_all(list(self.at(t).arrays().values()))
         logits = self._file.gaussians["opacity_logits"]
         if self._file.field_config.appearance_size == 4:
             logits = opacity_logits(opacities)
@@ -105,7 +102,7 @@ def activate(stored: dict[str, Floats], sh_degree: int) -> dict[str, Floats]:
         "quats": quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12),
         "scales": scales,
         "opacities": 0.5 + 0.5 * np.tanh(0.5 * stored["opacity_logits"]),
-        "colors": np.concatenate([stored["sh_dc"], stored["sh_rest"][:, :used]], axis=1),
+        "sh": np.concatenate([stored["sh_dc"], stored["sh_rest"][:, :used]], axis=1),
     }
 
 
