@@ -18,9 +18,8 @@ from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.ground_truth import AHEAD, GroundTruth
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.motion_losses import acceleration_loss, compared_counts, draw_nearby, draw_times
-from lapgs_wgpu.train.nonfinite import Skipped, cause, check_parameters, finite
 from lapgs_wgpu.train.parts import LossTerm, Regularizer, weight_at
-from lapgs_wgpu.train.step_result import Measured, Scheduled
+from lapgs_wgpu.train.step_result import Measured, Scheduled, Skipped, cause, check_parameters, finite
 from lapgs_wgpu.train.view_order import Draws
 
 
@@ -48,22 +47,20 @@ class ExchangeStep:
     def take(self, scheduled: Scheduled, began: Callable[[], None]) -> Callable[[], Measured]:
         """Take a step; gives what it told.
 
-        began: called before anything changes, and after the last error that leaves all as it was.
+        began: called before anything changes, after the last error that leaves all as it was.
         Raises NumericalError where a parameter is not finite.
         """
         step, draws = scheduled.step, self._draws
-        view, drawn = draws.next(), draws.mark()
+        view = draws.next()
         compared = self._compared(scheduled, self._scene.timing(view.time))
         self._truth.prefetch([view, *draws.coming(AHEAD)])
         self._learners.zero_grad()
         measured, rendering = self._descend(scheduled, view, *compared)
         d_means2d = rendering.means2d.grad
         assert d_means2d is not None
-        what = self._not_finite(measured, d_means2d, began)
         began()
-        if what:
+        if what := self._not_finite(measured, d_means2d):
             self._learners.zero_grad()
-            draws.go_back(drawn)
             measured = measured._replace(skipped=Skipped(step, view.name, what))
         else:
             self._learners.step(step, scheduled.share)
@@ -127,7 +124,7 @@ class ExchangeStep:
         terms |= {name: value.item() for name, value in of_motion.items()}
         return Measured(loss.item(), rendering.psnr, terms=terms), rendering
 
-    def _not_finite(self, measured: Measured, d_means2d: Tensor, began: Callable[[], None]) -> str:
+    def _not_finite(self, measured: Measured, d_means2d: Tensor) -> str:
         """What is not finite in the loss and gradients of a step, for which it is skipped; "" where all is well.
 
         Raises NumericalError for a parameter, whose values a step cannot mend.
@@ -136,9 +133,5 @@ class ExchangeStep:
         gradients["the places in the image"] = [d_means2d]
         if math.isfinite(measured.loss) and finite(parameters, gradients):
             return ""
-        try:
-            check_parameters(parameters)
-        except Exception:
-            began()
-            raise
+        check_parameters(parameters)
         return cause(measured.terms, gradients)

@@ -12,11 +12,11 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.camera_refinement import CameraRefinement, ScenePoints, scene_points
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.exposure import Exposures
-from lapgs_wgpu.train.nonfinite import Tensors
 from lapgs_wgpu.train.optimizer import FrequencyOptimizer, Optimizer
 from lapgs_wgpu.train.parts import Parts
 from lapgs_wgpu.train.setup import nyquist_frequency
 from lapgs_wgpu.train.start import Start, max_field_rates
+from lapgs_wgpu.train.step_result import Tensors
 
 Refiner = FrequencyOptimizer | Exposures | CameraRefinement
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from lapgs_wgpu.data.views import View
 from lapgs_wgpu.gpu.array import DeviceArray
@@ -128,8 +127,9 @@ class ResidentCorrections:
 
     def record_check(self, commands: Commands, bad: DeviceArray) -> None:
         """Record the search for gradients that are not finite."""
-        for gradient in self._gradients().values():
-            check_finite(commands, self._pool, gradient, bad)
+        for gradient, used in ((self._d_camera, self.moves_camera), (self._d_exposure, self._exposures is not None)):
+            if used:
+                check_finite(commands, self._pool, gradient, bad)
 
     def record_step(self, commands: Commands, guard: DeviceArray, frame: DeviceArray, geometry: DeviceArray) -> None:
         """Record a step of the corrections, after the one of the Gaussians. frame: that `move` gave; geometry: (N, 12)
@@ -164,14 +164,6 @@ class ResidentCorrections:
         arrays = {"guard": guard, "motion": motion, "d_camera": self._d_camera, "common_motions": self._common}
         descent = self._pool.varying("camera step", write)
         commands.dispatch(kernel, 1, descent=descent, cameras=self._value("cameras"), **arrays)
-
-    def gradients(self) -> dict[str, list[Tensor]]:
-        """Of the view's corrections, read back; for the text of an error."""
-        return {name: [torch.from_numpy(gradient.read())] for name, gradient in self._gradients().items()}
-
-    def _gradients(self) -> dict[str, DeviceArray]:
-        found = {"cameras": self._d_camera} if self.moves_camera else {}
-        return found | ({"exposure": self._d_exposure} if self._exposures is not None else {})
 
     def _value(self, name: str) -> DeviceArray:
         return self._blocks[name][0].arrays["value"]

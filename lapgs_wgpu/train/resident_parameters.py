@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.array import DeviceArray, read_all
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.laplacian import VARIANCE_FLOOR, VARIANCE_SPREAD
@@ -39,8 +39,7 @@ class Block:
 
     group: of the optimizer that all values belong to; None where each tensor is a group of its own. parts: by name of a
     tensor its place. ones: whether the last column holds ones, which no step changes. moved: number of values that Adam
-    moves; the others have an optimizer of their own. moving: whether only steps with motion move them. first: number
-    of the part's array. arrays: by kind.
+    moves; the others have an optimizer of their own. moving: whether only steps with motion move them. arrays: by kind.
     """
 
     name: str
@@ -50,7 +49,6 @@ class Block:
     ones: bool = False
     moved: int | None = None
     moving: bool = True
-    first: int = 0
     arrays: dict[str, DeviceArray] = field(default_factory=dict)
 
     @property
@@ -95,31 +93,26 @@ class ResidentParameters:
 
     def _lay_out(self, part: str) -> None:
         """Make arrays for the tensors of a part as they are."""
-        blocks, size = self._gaussians_layout() if part == "gaussians" else self._field_layout(), 0
-        for block in blocks:
-            block.first, size = size, size + -(-math.prod(block.shape) // ALIGNED) * ALIGNED
+        blocks = self._blocks_of[part] = self._gaussians_layout() if part == "gaussians" else self._field_layout()
+        ends = np.cumsum([-(-math.prod(block.shape) // ALIGNED) * ALIGNED for block in blocks]).tolist()
         for kind in KINDS:
-            array = self._arrays[part, kind] = self._pool.array(f"{part} {kind}", (size,))
-            for block in blocks:
-                block.arrays[kind] = DeviceArray(array.buffer, block.shape, offset=4 * block.first)
-        self._blocks_of[part] = blocks
+            array = self._arrays[part, kind] = self._pool.array(f"{part} {kind}", (sum(ends[-1:]),))
+            for block, first in zip(blocks, [0, *ends], strict=False):
+                block.arrays[kind] = DeviceArray(array.buffer, block.shape, offset=4 * first)
 
     def _write(self, part: str, kind: str, tensors: Mapping[str, Tensor | None]) -> None:
         """Upload all of a kind; tensors that are None are zeros."""
-        content = np.zeros(self._arrays[part, kind].shape, np.float32)
         for block in self._blocks_of[part]:
             values = block.gather(tensors)
             if block.ones and kind == "value":
                 values[:, -1] = 1.0
-            content[block.first : block.first + values.size] = values.reshape(-1)
-        self._arrays[part, kind].write(content)
+            block.arrays[kind].write(values)
 
     def _read(self, part: str, kind: str, into: Mapping[str, Tensor]) -> None:
         """Copy all of a kind into tensors."""
-        content = self._arrays[part, kind].read()
-        for block in self._blocks_of[part]:
-            values = content[block.first : block.first + math.prod(block.shape)]
-            block.scatter(values.reshape(block.shape), into)
+        blocks = self._blocks_of[part]
+        for block, content in zip(blocks, read_all([block.arrays[kind] for block in blocks]), strict=True):
+            block.scatter(content, into)
 
     def _gaussians_layout(self) -> list[Block]:
         gaussians, every = self._tensors["gaussians"], slice(None)
@@ -166,8 +159,10 @@ class ResidentParameters:
             for kind, key in (("mean", "exp_avg"), ("square", "exp_avg_sq")):
                 self._write(part, kind, {name: each.get(key) for name, each in state.items()})
             if part == "field" and self._frequencies is not None:
-                content, self.steps[FREQUENCIES] = self._frequencies.packed()
-                self._frequency_state = self._pool.upload("frequencies", content)
+                own = self._frequencies.state()
+                self.steps[FREQUENCIES] = int(own["steps"])
+                moments = np.append(own["mean"].numpy(), np.float32(own["square"]))
+                self._frequency_state = self._pool.upload("frequencies", moments)
         self.values_on_host, self.state_on_host = set(), set()
 
     @torch.no_grad()
@@ -190,7 +185,10 @@ class ResidentParameters:
                 if self.steps[name] and name != FREQUENCIES:
                     self._optimizer.set_state(tensor, self.steps[name], means[name], squares[name])
             if part == "field" and self._frequencies is not None:
-                self._frequencies.unpack(self._frequency_state.read(), self.steps[FREQUENCIES])
+                moments, own = self._frequency_state.read(), self._frequencies.state()
+                own["mean"].copy_(torch.from_numpy(moments[:-1]))
+                own["square"].fill_(float(moments[-1]))
+                own["steps"].fill_(self.steps[FREQUENCIES])
 
     @property
     def blocks(self) -> dict[str, Block]:
@@ -214,11 +212,6 @@ class ResidentParameters:
 
     def _moved(self, *, moving: bool) -> Iterator[Block]:
         return (block for block in self.blocks.values() if moving or not block.moving)
-
-    def clear_gradients(self, commands: Commands) -> None:
-        """Record zeros for the gradients, which each step of Adam leaves."""
-        for part in PARTS:
-            commands.clear(self._arrays[part, "gradient"])
 
     def record_check(self, commands: Commands, bad: DeviceArray, *, moving: bool) -> None:
         """Record the search for gradients that are not finite."""
@@ -278,13 +271,6 @@ class ResidentParameters:
         spectrum = self._pool.varying("frequencies uniform", write)
         weights = {"weights": self.flat_weights("value"), "d_weights": self.flat_weights("gradient")}
         commands.dispatch(kernel, 1, spectrum=spectrum, guard=guard, state=self._frequency_state, **weights)
-
-    def gradients(self) -> dict[str, list[Tensor]]:
-        """Of each tensor, read back; for the text of an error."""
-        gradients = {name: torch.zeros_like(t) for part in PARTS for name, t in self._tensors[part].items()}
-        for part in PARTS:
-            self._read(part, "gradient", gradients)
-        return {name: [gradient] for name, gradient in gradients.items()}
 
 
 def check_finite(commands: Commands, pool: BufferPool, values: DeviceArray, bad: DeviceArray) -> None:

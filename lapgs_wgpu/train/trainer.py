@@ -28,16 +28,16 @@ from lapgs_wgpu.train.exchange_step import ExchangeStep
 from lapgs_wgpu.train.ground_truth import GroundTruth
 from lapgs_wgpu.train.host import step_threads, torch_threads
 from lapgs_wgpu.train.learners import Learners
-from lapgs_wgpu.train.nonfinite import MOST_SKIPPED, Skipped
 from lapgs_wgpu.train.parts import Parts
 from lapgs_wgpu.train.resident_step import ResidentStep
 from lapgs_wgpu.train.setup import set_up, why_exchange
 from lapgs_wgpu.train.start import Start, start_from_points
-from lapgs_wgpu.train.step_result import Scheduled, StepResult
+from lapgs_wgpu.train.step_result import Measured, Scheduled, StepResult
 from lapgs_wgpu.train.timing_refinement import TimingRefinement
 from lapgs_wgpu.train.view_order import Draws
 
 MAX_SH_DEGREE = 3
+MOST_SKIPPED = 10  # steps in a row, which end a training
 
 
 class Trainer:
@@ -117,9 +117,7 @@ class Trainer:
         self._exchange = ExchangeStep(config, scene, self.parts.losses, dataset, *shared)
         self._resident = None
         if config.step_place == "resident":
-            self._resident = ResidentStep(config, scene, *shared, dataset.moments)
-            self._resident.broken = self._broken
-            self._resident.tell = lambda measured: self._note(measured.skipped)
+            self._resident = ResidentStep(config, scene, *shared, dataset.moments, self._broken, self._note)
         self._plans, camera = rasterizer_of(scene.device).plans, dataset.train[0].camera
         self._drawn = (camera.width, camera.height, True)  # the kind of images that the steps draw
         self._plans.set_bands(self._drawn, 1)
@@ -220,7 +218,7 @@ class Trainer:
         self.done = step
         self.whole = True
         if self._resident is None:
-            self._note(measured().skipped)
+            self._note(measured())
         return StepResult(step, self.config.schedule.steps, measured)
 
     def _share_of_rates(self, step: int) -> float:
@@ -229,11 +227,12 @@ class Trainer:
         falling, left = self.config.schedule.cool_down * steps, steps - step + 1
         return min(1.0, step / rising if rising else 1.0, left / falling if falling else 1.0)
 
-    def _note(self, skipped: Skipped | None) -> None:
+    def _note(self, measured: Measured) -> None:
         """Take in whether a step was skipped. Raises NumericalError where too many in a row were."""
-        self._skipped = 0 if skipped is None else self._skipped + 1
+        self._skipped = 0 if measured.skipped is None else self._skipped + 1
         if self._skipped == MOST_SKIPPED:
-            raise NumericalError(f"{MOST_SKIPPED} steps in a row had values that are not finite; the last: {skipped}")
+            what = f"{MOST_SKIPPED} steps in a row had values that are not finite; the last: {measured.skipped}"
+            raise NumericalError(what)
 
     def _began(self) -> None:
         self.whole = False
