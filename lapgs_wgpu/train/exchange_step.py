@@ -18,7 +18,7 @@ from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.ground_truth import AHEAD, GroundTruth
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.motion_losses import acceleration_loss, compared_counts, draw_nearby, draw_times
-from lapgs_wgpu.train.parts import LossTerm, Regularizer, weight_at
+from lapgs_wgpu.train.parts import LossTerm, Regularizer
 from lapgs_wgpu.train.step_result import Measured, Scheduled, Skipped, cause, check_parameters, finite
 from lapgs_wgpu.train.view_order import Draws
 
@@ -90,7 +90,7 @@ class ExchangeStep:
         learners = self._learners
         now = scene.deformed(view.time, nearby, time_samples) if moving else Deformed(scene.canonical(), None, [])
         weights = config.loss.weights(warm=moving)
-        weighted = [(term, weight) for term in self._own_terms if (weight := weight_at(term, scheduled.step))]
+        weighted = [(term, weight) for term in self._own_terms if (weight := term.weight_at(scheduled.step))]
         of_image = [(term, weight) for term, weight in weighted if not isinstance(term, Regularizer)]
         rendering = render_loss(
             now.gaussians,

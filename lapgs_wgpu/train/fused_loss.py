@@ -21,7 +21,7 @@ from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.exposure import ExposurePasses
 from lapgs_wgpu.train.image_loss import ImageLoss
 from lapgs_wgpu.train.image_metrics import psnr_of
-from lapgs_wgpu.train.parts import TorchLoss, torch_loss
+from lapgs_wgpu.train.parts import LossTerm, torch_loss
 
 
 class RenderLoss(NamedTuple):
@@ -55,7 +55,7 @@ def render_loss(
     weights: LossWeights,
     device: Device,
     correction: Tensor | None = None,
-    own: Sequence[tuple[TorchLoss, float]] = (),
+    own: Sequence[tuple[LossTerm, float]] = (),
     camera_change: Tensor | None = None,
     camera_unit: float = 1.0,
 ) -> RenderLoss:

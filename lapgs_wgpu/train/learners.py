@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor
@@ -14,11 +14,8 @@ from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.exposure import Exposures
 from lapgs_wgpu.train.optimizer import FrequencyOptimizer, Optimizer
 from lapgs_wgpu.train.parts import Parts
-from lapgs_wgpu.train.setup import nyquist_frequency
-from lapgs_wgpu.train.start import Start, max_field_rates
+from lapgs_wgpu.train.setup import Start, max_field_rates, nyquist_frequency
 from lapgs_wgpu.train.step_result import Tensors
-
-Refiner = FrequencyOptimizer | Exposures | CameraRefinement
 
 
 class Learners:
@@ -43,7 +40,7 @@ class Learners:
         if config.exposure.enabled:
             count = len(dataset.cameras) if dataset.is_rig else len(dataset.train)
             self._exposures = Exposures(count, config.exposure.rate)
-        if config.cameras.refines(own_footage=dataset.own_footage):
+        if config.cameras.refine == "on" or (config.cameras.refine == "auto" and dataset.own_footage):
 
             def points() -> ScenePoints:
                 return scene_points(scene.parameters["means"], scene.parameters["opacity_logits"].sigmoid())
@@ -117,10 +114,8 @@ class Learners:
         for each in self._refiners():
             restore_tensors(each.state(), state[each.name], each.name)
 
-    def _refiners(self) -> Iterator[Refiner]:
-        for each in (self.frequencies, self.exposures, self.cameras):
-            if each is not None:
-                yield each
+    def _refiners(self) -> list[FrequencyOptimizer | Exposures | CameraRefinement]:
+        return [each for each in (self.frequencies, self.exposures, self.cameras) if each is not None]
 
 
 @torch.no_grad()

@@ -15,8 +15,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.progress import duration
 from lapgs_wgpu.train.config import Config, changed
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.setup import open_dataset
-from lapgs_wgpu.train.start import start_from_points
+from lapgs_wgpu.train.setup import open_dataset, start_from_points
 from lapgs_wgpu.train.trainer import Trainer
 
 FILM, MASKS = "a film with masks of what moves", "masks"  # the latter is lapgs-prepare's folder of them

@@ -30,8 +30,7 @@ from lapgs_wgpu.train.host import step_threads, torch_threads
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.parts import Parts
 from lapgs_wgpu.train.resident_step import ResidentStep
-from lapgs_wgpu.train.setup import set_up, why_exchange
-from lapgs_wgpu.train.start import Start, start_from_points
+from lapgs_wgpu.train.setup import Start, set_up, start_from_points, why_exchange
 from lapgs_wgpu.train.step_result import Measured, Scheduled, StepResult
 from lapgs_wgpu.train.timing_refinement import TimingRefinement
 from lapgs_wgpu.train.view_order import Draws
