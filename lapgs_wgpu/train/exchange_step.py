@@ -15,12 +15,11 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.density_control import DensityControl
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
-from lapgs_wgpu.train.ground_truth import AHEAD, GroundTruth
+from lapgs_wgpu.train.ground_truth import Draws, GroundTruth
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.motion_losses import acceleration_loss, compared_counts, draw_nearby, draw_times
 from lapgs_wgpu.train.parts import LossTerm, Regularizer
 from lapgs_wgpu.train.step_result import Measured, Scheduled, Skipped, cause, check_parameters, finite
-from lapgs_wgpu.train.view_order import Draws
 
 
 class ExchangeStep:
@@ -50,10 +49,8 @@ class ExchangeStep:
         began: called before anything changes, after the last error that leaves all as it was.
         Raises NumericalError where a parameter is not finite.
         """
-        step, draws = scheduled.step, self._draws
-        view = draws.next()
+        step, view = scheduled.step, self._draws.next()
         compared = self._compared(scheduled, self._scene.timing(view.time))
-        self._truth.prefetch([view, *draws.coming(AHEAD)])
         self._learners.zero_grad()
         measured, rendering = self._descend(scheduled, view, *compared)
         d_means2d = rendering.means2d.grad

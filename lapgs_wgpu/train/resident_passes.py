@@ -23,11 +23,11 @@ from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config, LossWeights
 from lapgs_wgpu.train.fused_loss import image_loss_of
+from lapgs_wgpu.train.ground_truth import Mark
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.resident_corrections import ResidentCorrections
 from lapgs_wgpu.train.resident_parameters import ResidentParameters, check_finite
 from lapgs_wgpu.train.step_result import Measured, Scheduled
-from lapgs_wgpu.train.view_order import Mark
 
 TOTALS = ("static", "temporal", "acceleration", "dynamics")  # sums of losses of motion, in their places
 _DYNAMICS_GROUPS, _MOST_COLUMNS = 64, 256  # common/dynamics.wgsl

@@ -23,14 +23,13 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.density_control import DensityControl
-from lapgs_wgpu.train.ground_truth import AHEAD, GroundTruth
+from lapgs_wgpu.train.ground_truth import Draws, GroundTruth
 from lapgs_wgpu.train.image_metrics import psnr_of
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.motion_losses import compared_counts, even_times, near_time
 from lapgs_wgpu.train.resident_parameters import FREQUENCIES, PARTS
 from lapgs_wgpu.train.resident_passes import ResidentPasses, Task
 from lapgs_wgpu.train.step_result import Measured, Scheduled, Skipped, cause, check_parameters
-from lapgs_wgpu.train.view_order import Draws
 
 IN_FLIGHT = 2  # steps that are submitted and not waited for
 _RING_BYTES = 8192
@@ -142,7 +141,6 @@ class ResidentStep:
         if even:
             task.even = Samples(even, count, _draw_seed(generator))
             task.even_times = even_times(task.time, self._time_count, generator)
-        self._truth.prefetch([view, *self._draws.coming(AHEAD)])
         return task
 
     def _push(self) -> None:

@@ -25,7 +25,7 @@ from lapgs_wgpu.train.densify import Statistics
 from lapgs_wgpu.train.density_control import DensityControl
 from lapgs_wgpu.train.evaluate import evaluate
 from lapgs_wgpu.train.exchange_step import ExchangeStep
-from lapgs_wgpu.train.ground_truth import GroundTruth
+from lapgs_wgpu.train.ground_truth import Draws, GroundTruth
 from lapgs_wgpu.train.host import step_threads, torch_threads
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.parts import Parts
@@ -33,7 +33,6 @@ from lapgs_wgpu.train.resident_step import ResidentStep
 from lapgs_wgpu.train.setup import Start, set_up, start_from_points, why_exchange
 from lapgs_wgpu.train.step_result import Measured, Scheduled, StepResult
 from lapgs_wgpu.train.timing_refinement import TimingRefinement
-from lapgs_wgpu.train.view_order import Draws
 
 MAX_SH_DEGREE = 3
 MOST_SKIPPED = 10  # steps in a row, which end a training
@@ -104,7 +103,7 @@ class Trainer:
         config, scene, dataset = self.config, self.scene, self.dataset
         color = torch.full((3,), BACKGROUND_LEVELS[config.data.background])
         self._truth = GroundTruth(scene.device, color, int(config.data.cache_gb * 1e9))
-        self._draws = Draws(dataset.train, self._generator)
+        self._draws = Draws(dataset.train, self._generator, self._truth)
         self._learners = Learners(config, dataset, self.parts, start)
         self._density = DensityControl(config, scene, self._learners, self.parts.density, dataset, self._generator)
         self.timing = None
