@@ -222,8 +222,9 @@ def test_steps_of_corrections(device: Device, guard: int) -> None:
     (exact, exact_colors), (mine, mine_colors) = twin(), twin()
     before = torch.from_numpy(rng.normal(scale=0.02, size=(5, 6)))
     numbers = {view.name: number for number, view in enumerate(views)}
-    learners = SimpleNamespace(cameras=mine, exposures=mine_colors, image_numbers=numbers)
-    corrections, rasterizer = ResidentCorrections(device, learners), Rasterizer(device)
+    scene = SimpleNamespace(device=device)
+    learners = SimpleNamespace(scene=scene, cameras=mine, exposures=mine_colors, image_numbers=numbers)
+    corrections, rasterizer = ResidentCorrections(learners), Rasterizer(device)
     for refinement in (exact, mine):
         refinement.state()["learnt"].copy_(before)
     corrections.push()

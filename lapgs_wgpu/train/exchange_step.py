@@ -4,44 +4,28 @@ shared, and wherever torch computes a part of the step, such as a field or a los
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 from torch import Tensor
 
-from lapgs_wgpu.data.views import Dataset, View
+from lapgs_wgpu.data.views import View
 from lapgs_wgpu.motion.fields.deformation import Deformed, Nearby, TimeSamples
 from lapgs_wgpu.motion.fields.dynamics import dynamics_loss
-from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.density_control import DensityControl
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
-from lapgs_wgpu.train.ground_truth import Draws, GroundTruth
+from lapgs_wgpu.train.ground_truth import Draws
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.motion_losses import acceleration_loss, compared_counts, draw_nearby, draw_times
-from lapgs_wgpu.train.parts import LossTerm, Regularizer
+from lapgs_wgpu.train.parts import Regularizer
 from lapgs_wgpu.train.step_result import Measured, Scheduled, Skipped, cause, check_parameters, finite
 
 
 class ExchangeStep:
-    """Takes the steps of a training: the gradients of a view's loss, then the optimizers.
+    """Takes the steps of a training: the gradients of a view's loss, then the optimizers."""
 
-    own_terms: of the loss, beside those of the configuration (docs/api.md).
-    """
-
-    def __init__(
-        self,
-        config: Config,
-        scene: Scene4D,
-        own_terms: Sequence[LossTerm],
-        dataset: Dataset,
-        learners: Learners,
-        density: DensityControl,
-        truth: GroundTruth,
-        draws: Draws,
-    ) -> None:
-        self._config, self._scene, self._own_terms = config, scene, own_terms
-        self._time_count, self._extent = dataset.moments, dataset.extent
-        self._learners, self._density, self._truth, self._draws = learners, density, truth, draws
+    def __init__(self, learners: Learners, density: DensityControl, draws: Draws) -> None:
+        self._learners, self._density, self._draws = learners, density, draws
+        self._config, self._scene, self._time_count = learners.config, learners.scene, learners.dataset.moments
 
     def take(self, scheduled: Scheduled, began: Callable[[], None]) -> Callable[[], Measured]:
         """Take a step; gives what it told.
@@ -84,22 +68,22 @@ class ExchangeStep:
     ) -> tuple[Measured, RenderLoss]:
         """Add the gradients of a view's loss to those of all that learns."""
         config, scene, moving = self._config, self._scene, scheduled.moving
-        learners = self._learners
+        learners, truth = self._learners, self._draws.truth
         now = scene.deformed(view.time, nearby, time_samples) if moving else Deformed(scene.canonical(), None, [])
         weights = config.loss.weights(warm=moving)
-        weighted = [(term, weight) for term in self._own_terms if (weight := term.weight_at(scheduled.step))]
+        weighted = [(term, weight) for term in learners.parts.losses if (weight := term.weight_at(scheduled.step))]
         of_image = [(term, weight) for term, weight in weighted if not isinstance(term, Regularizer)]
         rendering = render_loss(
             now.gaussians,
             learners.camera(view),
-            self._truth.on_device(view),
-            self._truth.color,
+            truth.on_device(view),
+            truth.color,
             weights,
             scene.device,
             learners.exposure(view),
             of_image,
             learners.camera_change(view),
-            self._extent,
+            learners.dataset.extent,
         )
         of_motion: dict[str, Tensor] = {}
         if now.smoothness is not None:

@@ -84,18 +84,19 @@ class Mark(NamedTuple):
 class Draws:
     """What the steps of a training draw: views in random order without replacement, epoch after epoch.
 
-    generator: of whatever else they draw. left: the numbers of the views that are still to come in this epoch.
+    generator: of whatever else they draw. truth: the images. left: the numbers of the views that are still to come in
+    this epoch.
     """
 
     def __init__(self, views: Sequence[View], generator: torch.Generator, truth: GroundTruth) -> None:
-        self._views, self.generator, self._truth = views, generator, truth
+        self._views, self.generator, self.truth = views, generator, truth
         self.left: list[int] = []
 
     def next(self) -> View:
         """The next view, whose image, and those after it in this epoch, are decoded meanwhile."""
         if not self.left:
             self.left = torch.randperm(len(self._views), generator=self.generator).tolist()
-        self._truth.prefetch(self._views[number] for number in self.left[: AHEAD + 1])
+        self.truth.prefetch(self._views[number] for number in self.left[: AHEAD + 1])
         return self._views[self.left.pop(0)]
 
     def mark(self) -> Mark:

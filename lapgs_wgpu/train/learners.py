@@ -21,13 +21,14 @@ from lapgs_wgpu.train.step_result import Tensors
 class Learners:
     """The optimizer of the Gaussians and the field, and what learns beside it.
 
-    frequencies: of the motion spectrum; None where there is none. image_numbers: by name of a training view the number
-    of its colors' correction. on_access: called before corrections are read or changed from outside: a device may have
-    newer ones.
+    config, dataset, parts, scene: of the training. frequencies: of the motion spectrum; None where there is none.
+    image_numbers: by name of a training view the number of its colors' correction. on_access: called before corrections
+    are read or changed from outside: a device may have newer ones.
     """
 
     def __init__(self, config: Config, dataset: Dataset, parts: Parts, start: Start) -> None:
-        scene = start.scene
+        self.config, self.dataset, self.parts = config, dataset, parts
+        scene = self.scene = start.scene
         self._groups = scene.field.parameter_groups() if scene.field else {}
         rates = parts.rates_of(config.rates.schedules(), scene.parameters, self._groups)
         self.optimizer = Optimizer(scene.parameters, self._groups, rates)

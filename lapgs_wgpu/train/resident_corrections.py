@@ -6,7 +6,6 @@ import torch
 
 from lapgs_wgpu.data.views import View
 from lapgs_wgpu.gpu.array import DeviceArray
-from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.matmul import sum_columns
 from lapgs_wgpu.gpu.pool import BufferPool
@@ -42,8 +41,9 @@ class ResidentCorrections:
     on_host: whether the host may have changed them since they were pushed.
     """
 
-    def __init__(self, device: Device, learners: Learners) -> None:
-        self._device, self._pool, self._exposing = device, BufferPool(device), exposure_of(device)
+    def __init__(self, learners: Learners) -> None:
+        device = self._device = learners.scene.device
+        self._pool, self._exposing = BufferPool(device), exposure_of(device)
         self._cameras, self._exposures, self._numbers = learners.cameras, learners.exposures, learners.image_numbers
         self._blocks: list[tuple[Block, CameraRefinement | Exposures]] = []
         if self._cameras is not None:

@@ -22,7 +22,6 @@ from lapgs_wgpu.motion.fields.laplacian import VARIANCE_FLOOR, VARIANCE_SPREAD
 from lapgs_wgpu.motion.passes.activation_passes import GEOMETRY_FLOATS, SH_FLOATS
 from lapgs_wgpu.motion.passes.decoder_passes import ALIGNED, FieldWeights
 from lapgs_wgpu.motion.passes.grid_field_passes import FieldArrays
-from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.optimizer import LARGEST_FREQUENCY_STEP
 
@@ -78,7 +77,8 @@ class ResidentParameters:
     steps: by name of a tensor, how many steps have moved it.
     """
 
-    def __init__(self, scene: Scene4D, weights: FieldWeights | None, learners: Learners) -> None:
+    def __init__(self, learners: Learners, weights: FieldWeights | None) -> None:
+        scene = learners.scene
         self._device, self._pool, self._weights = scene.device, BufferPool(scene.device), weights
         self._optimizer, self._frequencies = learners.optimizer, learners.frequencies
         tensors = dict(scene.field.named_parameters()) if scene.field is not None else {}

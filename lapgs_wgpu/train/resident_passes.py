@@ -17,11 +17,10 @@ from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.passes.activation_passes import ActivationPasses, Line
 from lapgs_wgpu.motion.passes.grid_field_passes import Comparison, Decoding, GridFieldPasses
 from lapgs_wgpu.motion.passes.samples import Samples
-from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.drawing import Drawing, GaussianGradients
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterizer_of
-from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config, LossWeights
+from lapgs_wgpu.train.config import BACKGROUND_LEVELS, LossWeights
 from lapgs_wgpu.train.fused_loss import image_loss_of
 from lapgs_wgpu.train.ground_truth import Mark
 from lapgs_wgpu.train.learners import Learners
@@ -72,11 +71,12 @@ class ResidentPasses:
     parameters, corrections: what the steps move, the latter of cameras and colors.
     """
 
-    def __init__(self, config: Config, scene: Scene4D, learners: Learners) -> None:
-        self._config, self._scene, self._device = config, scene, scene.device
+    def __init__(self, learners: Learners) -> None:
+        config, scene = self._config, self._scene = learners.config, learners.scene
+        self._device = scene.device
         self._field = GridFieldPasses(scene.device, scene.field_config) if isinstance(scene.field, GridField) else None
-        self.parameters = ResidentParameters(scene, self._field.weights if self._field else None, learners)
-        self.corrections = ResidentCorrections(scene.device, learners)
+        self.parameters = ResidentParameters(learners, self._field.weights if self._field else None)
+        self.corrections = ResidentCorrections(learners)
         self._activation = ActivationPasses(scene.device, scene.field_config)
         self.rasterizer, self._losses = rasterizer_of(scene.device), image_loss_of(scene.device)
         self._pool = BufferPool(scene.device)

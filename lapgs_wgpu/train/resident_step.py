@@ -19,11 +19,9 @@ from lapgs_wgpu.gpu.array import read_all
 from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.gpu.later import Ring
 from lapgs_wgpu.motion.passes.samples import Samples
-from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.gaussians import Gaussians
-from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.density_control import DensityControl
-from lapgs_wgpu.train.ground_truth import Draws, GroundTruth
+from lapgs_wgpu.train.ground_truth import Draws
 from lapgs_wgpu.train.image_metrics import psnr_of
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.motion_losses import compared_counts, even_times, near_time
@@ -45,20 +43,15 @@ class ResidentStep:
 
     def __init__(
         self,
-        config: Config,
-        scene: Scene4D,
         learners: Learners,
         density: DensityControl,
-        truth: GroundTruth,
         draws: Draws,
-        time_count: int,
         broken: Callable[[int | None], None],
         tell: Callable[[Measured], None],
     ) -> None:
-        self._config, self._scene, self._learners, self._density = config, scene, learners, density
-        self._truth, self._draws, self._time_count = truth, draws, time_count
-        self._broken, self._tell = broken, tell
-        self._passes = ResidentPasses(config, scene, learners)
+        self._learners, self._density, self._draws, self._broken, self._tell = learners, density, draws, broken, tell
+        self._scene = scene = learners.scene
+        self._passes = ResidentPasses(learners)
         self.parameters = self._passes.parameters
         self._ring = Ring(scene.device, _RING_BYTES)
         self._flying: deque[Task] = deque()
@@ -126,7 +119,8 @@ class ResidentStep:
         return measured
 
     def _task(self, scheduled: Scheduled) -> Task:
-        config, generator, learners, count = self._config, self._draws.generator, self._learners, len(self._scene)
+        learners, config, times = self._learners, self._learners.config, self._learners.dataset.moments
+        generator, count = self._draws.generator, len(self._scene)
         before, view = self._draws.mark(), self._draws.next()
         rates = learners.optimizer.rates_at(scheduled.step, scheduled.share)
         if learners.frequencies is not None:
@@ -134,13 +128,13 @@ class ResidentStep:
         task = Task(scheduled, before, view, self._scene.timing(view.time), self._scene.sh_degree, rates)
         near = even = 0
         if config.field.kind != "static":
-            near, even = compared_counts(config, scheduled, count, self._time_count, fitted=learners.field_fitted > 0)
+            near, even = compared_counts(config, scheduled, count, times, fitted=learners.field_fitted > 0)
         if near:
             task.near = Samples(near, count, _draw_seed(generator), config.smoothness.reach)
             task.near_time = near_time(config.smoothness, task.time, generator)
         if even:
             task.even = Samples(even, count, _draw_seed(generator))
-            task.even_times = even_times(task.time, self._time_count, generator)
+            task.even_times = even_times(task.time, times, generator)
         return task
 
     def _push(self) -> None:
@@ -152,7 +146,7 @@ class ResidentStep:
             self._passes.seen().write(np.stack(columns, axis=1).astype(np.float32))
 
     def _submit(self, task: Task) -> Task:
-        truth = self._truth.on_device(task.view)
+        truth = self._draws.truth.on_device(task.view)
         self._passes.check_driver(task)
         task.counts = dict(self.parameters.steps)
         with Commands(self._scene.device, whole=True) as commands:

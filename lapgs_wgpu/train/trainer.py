@@ -105,17 +105,17 @@ class Trainer:
         self._truth = GroundTruth(scene.device, color, int(config.data.cache_gb * 1e9))
         self._draws = Draws(dataset.train, self._generator, self._truth)
         self._learners = Learners(config, dataset, self.parts, start)
-        self._density = DensityControl(config, scene, self._learners, self.parts.density, dataset, self._generator)
+        self._density = DensityControl(self._learners, self._generator)
         self.timing = None
         if config.timing.refine and scene.field is not None and len(dataset.times) > 2:
             self.timing = TimingRefinement(scene, dataset.train, self._truth.on_host, self._picture, dataset.time_gap)
         self._timing_steps = config.timing.corrections(config.schedule.steps) if self.timing else []
         self._skipped = 0  # steps in a row
-        shared = self._learners, self._density, self._truth, self._draws
-        self._exchange = ExchangeStep(config, scene, self.parts.losses, dataset, *shared)
+        shared = self._learners, self._density, self._draws
+        self._exchange = ExchangeStep(*shared)
         self._resident = None
         if config.step_place == "resident":
-            self._resident = ResidentStep(config, scene, *shared, dataset.moments, self._broken, self._note)
+            self._resident = ResidentStep(*shared, self._broken, self._note)
         self._plans, camera = rasterizer_of(scene.device).plans, dataset.train[0].camera
         self._drawn = (camera.width, camera.height, True)  # the kind of images that the steps draw
         self._plans.set_bands(self._drawn, 1)
