@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import torch
 from torch import Tensor
 
 from lapgs_wgpu.data.views import View
@@ -14,8 +15,9 @@ from lapgs_wgpu.motion.fields.dynamics import dynamics_loss
 from lapgs_wgpu.train.density_control import DensityControl
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.ground_truth import Draws
+from lapgs_wgpu.train.image_metrics import psnr_of
 from lapgs_wgpu.train.learners import Learners
-from lapgs_wgpu.train.motion_losses import acceleration_loss, compared_counts, draw_nearby, draw_times
+from lapgs_wgpu.train.motion_losses import acceleration_loss, compared_counts, even_times, near_time
 from lapgs_wgpu.train.parts import Regularizer
 from lapgs_wgpu.train.step_result import Measured, Scheduled, Skipped, cause, check_parameters, finite
 
@@ -52,12 +54,17 @@ class ExchangeStep:
 
     def _compared(self, scheduled: Scheduled, t: float) -> tuple[Nearby | None, TimeSamples | None]:
         """Draw what the losses of motion compare at a time of the field, None for each that is off."""
-        config, count, generator = self._config, len(self._scene), self._draws.generator
-        near, even = compared_counts(config, scheduled, count, self._time_count, fitted=self._learners.field_fitted > 0)
-        nearby = draw_nearby(config.smoothness, near, count, t, generator) if near else None
-        if not even or self._scene.field is None:
-            return nearby, None
-        return nearby, draw_times(even, count, t, self._time_count, generator)
+        config, count, generator, times = self._config, len(self._scene), self._draws.generator, self._time_count
+        near, even = compared_counts(config, scheduled, count, times, fitted=self._learners.field_fitted > 0)
+        nearby = time_samples = None
+        if near:
+            smooth, rows = config.smoothness, torch.randint(count, (near,), generator=generator)
+            offsets = smooth.reach * (2 * torch.rand(near, 3, generator=generator) - 1)
+            nearby = Nearby(rows, offsets, near_time(smooth, t, generator), smooth.static, smooth.temporal)
+        if even and self._scene.field is not None:
+            rows = torch.randint(count, (even,), generator=generator)
+            time_samples = TimeSamples(rows, even_times(t, times, generator))
+        return nearby, time_samples
 
     def _descend(
         self,
@@ -103,7 +110,7 @@ class ExchangeStep:
         factors = {**weights._asdict(), **{term.name: weight for term, weight in of_image}}
         terms = {name: factors[name] * value for name, value in rendering.terms.items() if name in factors}
         terms |= {name: value.item() for name, value in of_motion.items()}
-        return Measured(loss.item(), rendering.psnr, terms=terms), rendering
+        return Measured(loss.item(), psnr_of(rendering.terms["mse"]), terms=terms), rendering
 
     def _not_finite(self, measured: Measured, d_means2d: Tensor) -> str:
         """What is not finite in the loss and gradients of a step, for which it is skipped; "" where all is well.

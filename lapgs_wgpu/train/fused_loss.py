@@ -20,7 +20,6 @@ from lapgs_wgpu.splat.rasterize import gradient_tensors, radii_and_centres, rast
 from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.exposure import ExposurePasses
 from lapgs_wgpu.train.image_loss import ImageLoss
-from lapgs_wgpu.train.image_metrics import psnr_of
 from lapgs_wgpu.train.parts import LossTerm, torch_loss
 
 
@@ -36,11 +35,6 @@ class RenderLoss(NamedTuple):
     terms: dict[str, float]
     radii: Tensor
     means2d: Tensor
-
-    @property
-    def psnr(self) -> float:
-        """In dB over all pixels and channels, at most 100 dB."""
-        return psnr_of(self.terms["mse"])
 
 
 # The passes of a device, whose buffers serve all calls of `render_loss`.

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 import torch
@@ -25,7 +26,6 @@ from lapgs_wgpu.motion.passes.grid_field_passes import FieldArrays
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.optimizer import LARGEST_FREQUENCY_STEP
 
-_MOST_RATES = 512  # columns with a rate of their own
 KINDS = ("value", "gradient", "mean", "square")
 PARTS = ("gaussians", "field")  # of a scene, which go between host and device by themselves
 FREQUENCIES = "motion.frequencies"
@@ -224,29 +224,25 @@ class ResidentParameters:
             for name in block.parts:
                 self.steps[name] += 1
 
-    def _rates(self, rates: Mapping[str, float], *, moving: bool) -> bytes:
-        """The corrected rates of a step, a pair for each column that has its own. rates: of the optimizer's groups."""
-        table, first = np.zeros((_MOST_RATES, 2), np.float32), 0
-        for block in self._moved(moving=moving):
-            columns = block.rate_columns
-            for name, (_, place) in block.parts.items():
-                if name != FREQUENCIES:
-                    own = table[first : first + columns]
-                    own[place if columns > 1 else 0] = _corrected(rates[block.group or name], self.steps[name])
-            first += columns
-        return table[:first].tobytes()
+    def _rates(self, block: Block, rates_of: Callable[[], Mapping[str, float]]) -> bytes:
+        """The corrected rates of a step, a pair for each column that has its own."""
+        table, rates = np.zeros((block.rate_columns, 2), np.float32), rates_of()
+        for name, (_, place) in block.parts.items():
+            if name != FREQUENCIES:
+                columns = place if block.group is None else 0
+                table[columns] = _corrected(rates[block.group or name], self.steps[name])
+        return table.tobytes()
 
     def record_adam(
         self, commands: Commands, guard: DeviceArray, rates_of: Callable[[], Mapping[str, float]], *, moving: bool
     ) -> None:
         """Record a step of the optimizers, by the rates of its groups and of FREQUENCIES."""
-        kernel, first = Kernel.get(self._device, "adam"), 0
-        written = self._pool.varying(f"rates {moving}", lambda: self._rates(rates_of(), moving=moving))
-        rates = DeviceArray(written.buffer, (written.nbytes // 8, 2), offset=written.offset)
+        kernel = Kernel.get(self._device, "adam")
         for block in self._moved(moving=moving):
+            written = self._pool.varying(f"rates {block.name}", partial(self._rates, block, rates_of))
+            rates = DeviceArray(written.buffer, (block.rate_columns, 2), offset=written.offset)
             count = block.arrays["value"].size if block.moved is None else block.moved
-            content = kernel.uniform("Adam", count=count, columns=block.rate_columns, first=first)
-            first += block.rate_columns
+            content = kernel.uniform("Adam", count=count, columns=block.rate_columns, first=0)
             arrays = {name: block.arrays[name[:-1]] for name in ("gradients", "values", "means", "squares")}
             adam = self._pool.constant(content)
             commands.dispatch(kernel, -(-count // 256), adam=adam, guard=guard, rates=rates, **arrays)

@@ -155,8 +155,12 @@ class Trainer:
     def evaluate(self, views: Sequence[View] | None = None) -> dict[str, Any]:
         """Measure the scene on views, the test views where None: the content of metrics.json (docs/metrics.md).
         Training views are seen by their corrected cameras."""
-        chosen = self.dataset.test if views is None else views
-        return evaluate(self.scene, self._as_seen(chosen), self.config.data.background)
+        trained, chosen = set(self.dataset.cameras), self.dataset.test if views is None else views
+        seen = [
+            dataclasses.replace(view, camera=self._learners.camera(view)) if view.camera in trained else view
+            for view in chosen
+        ]
+        return evaluate(self.scene, seen, self.config.data.background)
 
     def psnr(self, views: Sequence[View]) -> float:
         """The mean over views of the PSNR, dB, as `evaluate` measures it."""
@@ -240,14 +244,6 @@ class Trainer:
         left to go back to."""
         self.whole = settled is not None
         self.done = self.done if settled is None else settled
-
-    def _as_seen(self, views: Sequence[View]) -> list[View]:
-        """The views, those by cameras of the training with the corrections of these."""
-        trained = set(self.dataset.cameras)
-        return [
-            dataclasses.replace(view, camera=self._learners.camera(view)) if view.camera in trained else view
-            for view in views
-        ]
 
     @torch.no_grad()
     def _picture(self, view: View, timing: Timing) -> Tensor:
