@@ -40,9 +40,8 @@ class ScenePoints(NamedTuple):
 
 def scene_points(means: Tensor, opacities: Tensor) -> ScenePoints:
     """At most MOST_POINTS of a scene's Gaussians: means (N, 3), opacities (N,)."""
-    chosen = slice(None, None, -(-len(means) // MOST_POINTS))
-    points, weights = (values.detach()[chosen].double().numpy(force=True) for values in (means, opacities))
-    return ScenePoints(points, weights)
+    spacing = -(-len(means) // MOST_POINTS)
+    return ScenePoints(*(values.detach()[::spacing].double().numpy(force=True) for values in (means, opacities)))
 
 
 def image_motion(camera: Camera, points: ScenePoints, unit: float) -> Array:

@@ -127,7 +127,13 @@ def _read(preset: str, seen: tuple[str, ...] = ()) -> Table:
     """The table of a preset, laid over its base's."""
     if preset in seen:
         raise InputError(f"{preset}: its base leads back to itself ({' -> '.join((*seen, preset))}).")
-    table = _read_file(preset) if preset.endswith(".toml") else _read_packaged(preset)
+    if preset.endswith(".toml"):
+        table = _read_file(preset)
+    elif preset in _packaged():
+        table = dict(_packaged()[preset])
+    else:
+        hint = did_you_mean(preset, preset_names(), f"; there are {', '.join(preset_names())}, or give a .toml file.")
+        raise InputError(f"there is no preset {preset!r}{hint}")
     base = table.pop("base", None)
     if base is None:
         return table
@@ -145,15 +151,6 @@ def _read_file(path: str) -> Table:
     if of_a_run and (gone := _remove_unknown(table, Config)):
         print(f"note: {path}: ignores {', '.join(gone)}, which this version does not know.", file=sys.stderr)
     return table
-
-
-def _read_packaged(name: str) -> Table:
-    presets = _packaged()
-    if name not in presets:
-        names = preset_names()
-        hint = did_you_mean(name, names, f"; there are {', '.join(names)}, or give a .toml file.")
-        raise InputError(f"there is no preset {name!r}{hint}")
-    return dict(presets[name])
 
 
 @functools.cache
