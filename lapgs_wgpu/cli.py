@@ -11,7 +11,7 @@ from pathlib import Path
 from lapgs_wgpu.command import guarded, print_devices
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.progress import say
-from lapgs_wgpu.train.presets import config_keys, load_config, rates_that_stay
+from lapgs_wgpu.train.presets import config_keys, load_config
 from lapgs_wgpu.train_options import parse_options
 
 if typing.TYPE_CHECKING:
@@ -62,8 +62,6 @@ def _train(arguments: list[str]) -> None:
     check_run_folder(out, overwrite=overwrite)
     device = open_device(options["device"])
     config, dataset = _open_data(config, out.parent)
-    if note := rates_that_stay(config, overrides):
-        print(f"note: {note}", file=sys.stderr)
     train(config, dataset, out, device=device, overwrite=overwrite, watch=watch, lpips=lpips)
     say(result_text(out))
 
@@ -77,7 +75,7 @@ def _resume(
 ) -> None:
     from lapgs_wgpu.gpu.device import open_device
     from lapgs_wgpu.run import resume
-    from lapgs_wgpu.train.run_folder import changes_since, check_same_data, result_text
+    from lapgs_wgpu.train.run_folder import check_same_data, result_text
 
     _check_alone("resume", options, [key for key in overrides if key not in RESUME_KEYS], allowed=("view",))
     config = _config_of(run, overrides, "--resume needs the folder of a run")
@@ -85,8 +83,6 @@ def _resume(
     config, dataset = _open_data(config, run.parent)
     if "data.path" in overrides:
         check_same_data(run, config.data.path, dataset)
-    for what, before, now in changes_since(run, config, device, dataset):
-        print(f"lapgs-train: {what} was {before} when {run} began and is {now}: bits may differ.", file=sys.stderr)
     resume(config, dataset, run, device=device, watch=watch, lpips=lpips)
     say(result_text(run))
 

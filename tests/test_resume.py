@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from helpers.interrupts import handled, interrupt_at
 from helpers.training import STEPS, configure
 from synthetic import write_synthetic
@@ -33,7 +32,6 @@ from lapgs_wgpu.io.safe_json_toml import read_toml
 from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.train import run_folder
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.host import step_threads
 from lapgs_wgpu.train.presets import write_toml
 from lapgs_wgpu.train.run_folder import STATE, load_state, save_state
 from lapgs_wgpu.train.trainer import Trainer
@@ -232,22 +230,6 @@ def test_a_run_without_its_state_is_not_begun_again(
     with pytest.raises(InputError, match=r"a checkpoint, but no state to go on from \(state.safetensors\)"):
         resume(configure(), dataset, tmp_path, device=device)
     assert (tmp_path / "checkpoint.ply").read_bytes() == before
-
-
-def test_what_has_changed_since_the_run_began_is_told(
-    dataset: Dataset, data: Path, device: Device, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    config = configure(data__path=str(data), schedule__steps="3", schedule__save_interval="0")
-    run_folder.start_run_folder(tmp_path, config, device, dataset)
-    text = (tmp_path / "config.toml").read_text()
-    threads = step_threads(config.field, device) or torch.get_num_threads()
-    text = text.replace(f'torch_threads = "{threads}"', 'torch_threads = "99"')
-    (tmp_path / "config.toml").write_text(text.replace(f'driver = "{device.info.driver}"', 'driver = "another"'))
-    assert cli.train_command(["--resume", str(tmp_path)]) == 0
-    error = capfd.readouterr().err
-    assert f"driver was another when {tmp_path} began and is {device.info.driver}: bits may differ." in error
-    assert f"torch_threads was 99 when {tmp_path} began and is {threads}: bits may differ." in error
-    assert error.count("bits may differ") == 2
 
 
 @pytest.fixture

@@ -23,6 +23,7 @@ from lapgs_wgpu.gpu.device import Device
 
 DECODERS = min(4, os.cpu_count() or 1)  # threads that decode images before they are needed
 AHEAD = 8  # images that are decoded before they are needed
+Mark = tuple[Tensor, list[int]]  # where draws stand: the generator's state, and the views that are left of an epoch
 
 
 class GroundTruth:
@@ -74,13 +75,6 @@ class GroundTruth:
         self._kept.clear()
 
 
-class Mark(NamedTuple):
-    """Where the draws stand: the generator's state, and the views that are left of an epoch."""
-
-    random: Tensor
-    left: list[int]
-
-
 class Draws:
     """What the steps of a training draw: views in random order without replacement, epoch after epoch.
 
@@ -101,12 +95,13 @@ class Draws:
 
     def mark(self) -> Mark:
         """Where they stand, for `go_back`."""
-        return Mark(self.generator.get_state(), list(self.left))
+        return self.generator.get_state(), list(self.left)
 
     def go_back(self, mark: Mark) -> None:
         """Draw again what was drawn since."""
-        self.generator.set_state(mark.random)
-        self.left = list(mark.left)
+        random, left = mark
+        self.generator.set_state(random)
+        self.left = list(left)
 
 
 class HostImage(NamedTuple):

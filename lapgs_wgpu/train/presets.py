@@ -19,7 +19,7 @@ from lapgs_wgpu.errors import InputError, shown
 from lapgs_wgpu.io.dataclass_table import build_dataclass, checked, did_you_mean, field_types, from_text
 from lapgs_wgpu.io.safe_json_toml import read_toml
 from lapgs_wgpu.motion.fields.config import Method
-from lapgs_wgpu.train.config import Config, Rate
+from lapgs_wgpu.train.config import Config
 
 Table = dict[str, Any]
 ADVICE = '; add it, or start the file with base = "dnerf"'
@@ -79,18 +79,6 @@ def load_config(
             parsed = {part: parsed}
         base = _merge(base, parsed)
     return build_dataclass(Config, base, preset, advice=ADVICE)
-
-
-def rates_that_stay(config: Config, given: Mapping[str, Any]) -> str:
-    """A note where schedule.steps is among the values that were given, and learning rates do not follow it; else ""."""
-    fixed = [
-        f"rates.{name}.steps {rate.steps}"
-        for name, rate in vars(config.rates).items()
-        if isinstance(rate, Rate) and rate.steps != config.schedule.steps and f"rates.{name}.steps" not in given
-    ]
-    if "schedule.steps" not in given or not fixed:
-        return ""
-    return f"schedule.steps is {config.schedule.steps}, and other keys that count steps stay: {', '.join(fixed)}."
 
 
 def _shorthands(method: str | None, ablate: Iterable[str]) -> dict[str, Any]:
@@ -184,17 +172,10 @@ def _merge(below: Table, above: Table) -> Table:
 
 def _toml_lines(table: Mapping[str, Any], prefix: str) -> Iterator[str]:
     inner = {key: value for key, value in table.items() if isinstance(value, Mapping)}
-    yield from (f"{key} = {_toml_value(value)}" for key, value in table.items() if key not in inner)
+    for key, value in table.items():
+        if key not in inner:  # what JSON writes is TOML, but for one character
+            text = json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+            yield f"{key} = {text}"
     for key, value in inner.items():
         yield from ("", f"[{prefix}{key}]")
         yield from _toml_lines(value, f"{prefix}{key}.")
-
-
-def _toml_value(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, int | float):
-        return repr(value)
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    return f"[{', '.join(_toml_value(entry) for entry in value)}]"
