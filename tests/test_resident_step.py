@@ -84,7 +84,6 @@ def by_resident(trainer: Trainer, task: Task) -> dict[str, Tensor]:
         trainer._resident._passes.corrections,
     )
     parameters.record_adam = corrections.record_step = lambda *given, **more: None  # the gradients stay
-    step._push()
     step._submit(task)
     gradients = {name: torch.zeros_like(t) for part in PARTS for name, t in parameters._tensors[part].items()}
     for part in PARTS:

@@ -67,11 +67,7 @@ class ExchangeStep:
         return nearby, time_samples
 
     def _descend(
-        self,
-        scheduled: Scheduled,
-        view: View,
-        nearby: Nearby | None,
-        time_samples: TimeSamples | None,
+        self, scheduled: Scheduled, view: View, nearby: Nearby | None, time_samples: TimeSamples | None
     ) -> tuple[Measured, RenderLoss]:
         """Add the gradients of a view's loss to those of all that learns."""
         config, scene, moving = self._config, self._scene, scheduled.moving

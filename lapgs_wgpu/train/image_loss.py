@@ -53,11 +53,7 @@ class ImageLoss:
         self._lanes, self._run = (8, _WHOLE) if device.is_cpu else (64, 64)
 
     def record(
-        self,
-        commands: Commands,
-        image: DeviceArray,
-        truth: DeviceArray,
-        weights: LossWeights,
+        self, commands: Commands, image: DeviceArray, truth: DeviceArray, weights: LossWeights
     ) -> tuple[DeviceArray, DeviceArray]:
         """Compare an image with its ground truth.
 

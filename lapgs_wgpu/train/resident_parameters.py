@@ -166,16 +166,12 @@ class ResidentParameters:
         self.values_on_host, self.state_on_host = set(), set()
 
     @torch.no_grad()
-    def pull_values(self, *parts: str) -> None:
-        """Make torch's tensors of some parts, of all if none is named, the newest ones."""
+    def pull(self, *parts: str, state: bool) -> None:
+        """Make torch's tensors of some parts, of all if none is named, the newest ones. state: and the optimizers'."""
         for part in set(parts or PARTS) - self.values_on_host:
             self.values_on_host.add(part)
             self._read(part, "value", self._tensors[part])
-
-    @torch.no_grad()
-    def pull_state(self, *parts: str) -> None:
-        """Make torch's state of the optimizers of some parts, of all if none is named, the newest one."""
-        for part in set(parts or PARTS) - self.state_on_host:
+        for part in set(parts or PARTS) - self.state_on_host if state else ():
             self.state_on_host.add(part)
             tensors = self._tensors[part]
             means, squares = ({name: torch.zeros_like(tensor) for name, tensor in tensors.items()} for _ in range(2))

@@ -248,12 +248,7 @@ class ResidentPasses:
         self._total(commands, arrays["losses"], "dynamics", 1.0, totals)
 
     def _record_end(
-        self,
-        commands: Commands,
-        task: Task,
-        drawing: Drawing,
-        by_drawn: GaussianGradients,
-        terms: DeviceArray,
+        self, commands: Commands, task: Task, drawing: Drawing, by_drawn: GaussianGradients, terms: DeviceArray
     ) -> None:
         """Record whether the step may change anything, and what it changes."""
         moving, count, guard, bad = task.scheduled.moving, len(self._scene), self.word("guard"), self.word("bad")

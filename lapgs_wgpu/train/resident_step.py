@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
@@ -58,15 +59,16 @@ class ResidentStep:
         self._statistics_on_host = True
         self.settled = 0
         scene.on_access, scene.on_device = self.to_host, self.at
-        learners.optimizer.on_access = self.to_rest
+        learners.optimizer.on_access = partial(self.to_host, state=True)
         learners.on_access = self.corrections_to_host
 
     # Between steps ---------------------------------------------------------------------------------------------------
 
-    def to_host(self, *parts: str) -> None:
-        """Wait for all steps, and make the scene's tensors of some parts, of all if none is named, the newest ones."""
+    def to_host(self, *parts: str, state: bool = False) -> None:
+        """Wait for all steps, and make the scene's tensors of some parts, of all if none is named, the newest ones.
+        state: the optimizers' state of them, too."""
         self.settle()
-        self.parameters.pull_values(*parts)
+        self.parameters.pull(*parts, state=state)
         if "gaussians" in (parts or PARTS) and not self._statistics_on_host:
             self._statistics_on_host = True
             seen = torch.from_numpy(self._passes.seen().read())
@@ -77,11 +79,6 @@ class ResidentStep:
         """Wait for all steps, and make the host's corrections of cameras and colors the newest ones."""
         self.settle()
         self._passes.corrections.pull()
-
-    def to_rest(self, *parts: str) -> None:
-        """The same with the optimizers' state."""
-        self.to_host(*parts)
-        self.parameters.pull_state(*parts)
 
     def at(self, t: float) -> Gaussians[Tensor]:
         """The scene's Gaussians at a time of the field, from the newest parameters, which are not given out."""
@@ -105,7 +102,6 @@ class ResidentStep:
         """Submit a step, after `make_room`; gives what it will have told, for which that waits. began: called when it
         is submitted."""
         task = self._task(scheduled)
-        self._push()
         if not self._flying:
             self.settled = scheduled.step - 1
         self._flying.append(self._submit(task))
@@ -137,15 +133,13 @@ class ResidentStep:
             task.even_times = even_times(task.time, times, generator)
         return task
 
-    def _push(self) -> None:
+    def _submit(self, task: Task) -> Task:
         self.parameters.push()
         self._passes.corrections.push()
         if self._statistics_on_host:
             self._statistics_on_host = False
             columns = [values.numpy(force=True) for values in vars(self._density.statistics).values()]
             self._passes.seen().write(np.stack(columns, axis=1).astype(np.float32))
-
-    def _submit(self, task: Task) -> Task:
         truth = self._draws.truth.on_device(task.view)
         self._passes.check_driver(task)
         task.counts = dict(self.parameters.steps)
@@ -200,7 +194,6 @@ class ResidentStep:
                 raise
             skipped = Skipped(first.scheduled.step, first.view.name, cause(terms, {}))
             self._end(behind.pop(0), told._replace(skipped=skipped))
-            self._push()
         self._flying.extend(self._submit(each) for each in behind)
 
     def _end(self, task: Task, told: Measured) -> None:
