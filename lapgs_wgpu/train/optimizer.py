@@ -26,10 +26,7 @@ class Optimizer:
     """
 
     def __init__(
-        self,
-        gaussians: dict[str, nn.Parameter],
-        field: Mapping[str, list[nn.Parameter]],
-        rates: Mapping[str, Rate],
+        self, gaussians: dict[str, nn.Parameter], field: Mapping[str, list[nn.Parameter]], rates: Mapping[str, Rate]
     ) -> None:
         groups = {name: [parameter] for name, parameter in gaussians.items()} | dict(field)
         self.gaussians = gaussians

@@ -109,7 +109,6 @@ class Trainer:
         self.timing = None
         if config.timing.refine and scene.field is not None and len(dataset.times) > 2:
             self.timing = TimingRefinement(scene, dataset.train, self._truth.on_host, self._picture, dataset.time_gap)
-        self._timing_steps = config.timing.corrections(config.schedule.steps) if self.timing else []
         self._skipped = 0  # steps in a row
         shared = self._learners, self._density, self._draws
         self._exchange = ExchangeStep(*shared)
@@ -201,9 +200,9 @@ class Trainer:
         # Before this step draws: both may wait for steps in flight, which may draw again.
         if self._resident is not None:
             self._resident.make_room()
-        field_times = None
-        if self.timing is not None and moving and step in self._timing_steps:
-            field_times = self.timing.fitted(self._timing_steps.index(step))
+        field_times, corrections = None, self.config.timing.corrections(self.config.schedule.steps)
+        if self.timing is not None and moving and step in corrections:
+            field_times = self.timing.fitted(corrections.index(step))
         before = self._draws.mark()
         try:
             scheduled = Scheduled(step, moving, share, step < self.config.density.stop)
