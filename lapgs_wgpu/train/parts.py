@@ -28,13 +28,7 @@ Callback = Callable[[Any, StepResult], object]
 
 @dataclass(frozen=True)
 class LossTerm:
-    """A term of the loss, in torch.
-
-    Attributes:
-        name: in `StepResult.terms` and log.jsonl.
-        function: returns a scalar.
-        weight: of the term, or a function of the step, counted from 1; at 0 it is not computed.
-    """
+    """A term of the loss, in torch: a `Regularizer` or a `TorchLoss`."""
 
     name: str
     function: Callable[..., Tensor]
@@ -46,15 +40,24 @@ class LossTerm:
 
 
 class Regularizer(LossTerm):
-    """A term of the Gaussians: `function` of the scene, its Gaussians at the view's time (activated, differentiable in
-    the scene's parameters) and that time in [0, 1]."""
+    """A term of the Gaussians, in torch.
+
+    Attributes:
+        name: in `StepResult.terms` and log.jsonl.
+        function: of the scene, its Gaussians at the view's time (activated, differentiable in the scene's parameters)
+            and that time in [0, 1]; returns a scalar.
+        weight: of the term, or a function of the step, counted from 1; at 0 it is not computed.
+    """
 
 
 class TorchLoss(LossTerm):
-    """A term of the image: `function` of the image (H, W, 3), differentiable, and the ground truth (H, W, 3) in [0, 1].
+    """A term of the image, in torch. The image and its gradient then go through the host's memory in each step. Pixels
+    that the losses leave out (data.masks) have the image's own color as ground truth, and no gradient.
 
-    The image and its gradient then go through the host's memory in each step. Pixels that the losses leave out
-    (data.masks) have the image's own color as ground truth, and no gradient.
+    Attributes:
+        name: in `StepResult.terms` and log.jsonl.
+        function: of the image (H, W, 3), differentiable, and the ground truth (H, W, 3) in [0, 1]; returns a scalar.
+        weight: as in `Regularizer`.
     """
 
 
