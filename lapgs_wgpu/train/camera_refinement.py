@@ -124,8 +124,7 @@ class CameraRefinement:
     at each step: what moves how far in the image when a camera moves. before: corrections of some to go on from, at the
     final learning rate and from the first step on.
 
-    numbers: of the cameras (the same objects). common: (6 C, r) orthonormal: changes of all cameras that no image
-    shows.
+    numbers: of the cameras (the same objects). common: (6 C, r) orthonormal: changes that no image shows.
     """
 
     name = "cameras"

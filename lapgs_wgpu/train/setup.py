@@ -148,9 +148,8 @@ class Start:
 
     warm_up_steps: number of the first steps without motion. ramp_steps: of those over which the learning rates rise
     from 0. field_fitted: 0, or the field knows nearly all that moves: its rates then stay below this share of the
-    highest (`max_field_rates`), and the acceleration loss is left out.
-    corrections: of the training cameras; None where they are as given. summary:
-    what discovery found, a sentence; None without discovery. seconds: that discovery took.
+    highest (`max_field_rates`), and the acceleration loss is left out. corrections: of the training cameras; None where
+    they are as given. summary: what discovery found, a sentence; None without discovery. seconds: that discovery took.
     """
 
     scene: Scene4D
