@@ -6,7 +6,6 @@ next step pushes what the host may have changed.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -21,7 +20,7 @@ from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.laplacian import VARIANCE_FLOOR, VARIANCE_SPREAD
 from lapgs_wgpu.motion.passes.activation_passes import GEOMETRY_FLOATS, SH_FLOATS
-from lapgs_wgpu.motion.passes.decoder_passes import ALIGNED, FieldWeights
+from lapgs_wgpu.motion.passes.decoder_passes import FieldWeights
 from lapgs_wgpu.motion.passes.grid_field_passes import FieldArrays
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.optimizer import LARGEST_FREQUENCY_STEP
@@ -84,7 +83,6 @@ class ResidentParameters:
         tensors = dict(scene.field.named_parameters()) if scene.field is not None else {}
         self._tensors: dict[str, Mapping[str, Tensor]] = {"gaussians": scene.parameters, "field": tensors}  # by part
         self._blocks_of: dict[str, list[Block]] = {}  # by part
-        self._arrays: dict[tuple[str, str], DeviceArray] = {}  # of all blocks together, by part and kind
         self.steps: dict[str, int] = {}
         # The parts that the host may have changed since they were pushed: their values, the optimizers' state of them.
         self.values_on_host, self.state_on_host = set(PARTS), set(PARTS)
@@ -93,12 +91,9 @@ class ResidentParameters:
 
     def _lay_out(self, part: str) -> None:
         """Make arrays for the tensors of a part as they are."""
-        blocks = self._blocks_of[part] = self._gaussians_layout() if part == "gaussians" else self._field_layout()
-        ends = np.cumsum([-(-math.prod(block.shape) // ALIGNED) * ALIGNED for block in blocks]).tolist()
-        for kind in KINDS:
-            array = self._arrays[part, kind] = self._pool.array(f"{part} {kind}", (sum(ends[-1:]),))
-            for block, first in zip(blocks, [0, *ends], strict=False):
-                block.arrays[kind] = DeviceArray(array.buffer, block.shape, offset=4 * first)
+        self._blocks_of[part] = self._gaussians_layout() if part == "gaussians" else self._field_layout()
+        for block in self._blocks_of[part]:
+            block.arrays = {kind: self._pool.array(f"{block.name} {kind}", block.shape) for kind in KINDS}
 
     def _write(self, part: str, kind: str, tensors: Mapping[str, Tensor | None]) -> None:
         """Upload all of a kind; tensors that are None are zeros."""
@@ -211,8 +206,8 @@ class ResidentParameters:
 
     def record_check(self, commands: Commands, bad: DeviceArray, *, moving: bool) -> None:
         """Record the search for gradients that are not finite."""
-        for part in PARTS if moving else PARTS[:1]:
-            check_finite(commands, self._pool, self._arrays[part, "gradient"], bad)
+        for block in self._moved(moving=moving):
+            check_finite(commands, self._pool, block.arrays["gradient"], bad)
 
     def count_step(self, *, moving: bool) -> None:
         """A step that moves the parameters is about to be recorded."""
