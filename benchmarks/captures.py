@@ -93,8 +93,7 @@ def draw(folder: Path, cache_gb: float, steps: int, step: float) -> dict[str, fl
 
     from lapgs_wgpu.data import load_dataset
     from lapgs_wgpu.gpu.device import open_device
-    from lapgs_wgpu.train.ground_truth import AHEAD, GroundTruth
-    from lapgs_wgpu.train.view_order import Draws
+    from lapgs_wgpu.train.ground_truth import Draws, GroundTruth
 
     start = time.perf_counter()
     data = load_dataset(folder)
@@ -103,14 +102,12 @@ def draw(folder: Path, cache_gb: float, steps: int, step: float) -> dict[str, fl
     for frame in data.train[:: len(data.times)]:
         frame.load()
     unpacking, after_unpacking = time.perf_counter() - start, megabytes()
-    draws = Draws(data.train, torch.Generator().manual_seed(0))
     with closing(GroundTruth(open_device(), torch.zeros(3), int(cache_gb * 1e9))) as truth:
+        draws = Draws(data.train, torch.Generator().manual_seed(0), truth)
         waits = []
         for _ in range(steps):
             start = time.perf_counter()
-            view, _ = draws.next()
-            truth.prefetch([view, *draws.coming(AHEAD)])
-            truth.on_device(view)
+            truth.on_device(draws.next())
             waits.append(1e3 * (time.perf_counter() - start))
             time.sleep(step)
     steady = np.sort(waits[len(waits) // 5 :])

@@ -13,7 +13,7 @@ from pathlib import Path
 from lapgs_wgpu.command import guarded, print_devices
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.progress import say
-from lapgs_wgpu.train.presets import config_keys, load_config, rates_that_stay
+from lapgs_wgpu.train.presets import config_keys, load_config
 from lapgs_wgpu.train_options import parse_options
 
 if typing.TYPE_CHECKING:
@@ -66,8 +66,6 @@ def _train(arguments: list[str]) -> None:
     check_run_folder(out, overwrite=overwrite)
     device = open_device(options["device"])
     config, dataset = _open_data(config, out.parent)
-    if note := rates_that_stay(config, overrides):
-        print(f"note: {note}", file=sys.stderr)
     train(config, dataset, out, device=device, overwrite=overwrite, watch=watch, lpips=lpips)
     say(result_text(out))
 

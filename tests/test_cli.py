@@ -57,7 +57,7 @@ def test_training_writes_a_run_and_prints_its_result(
     assert metrics["size"] == [12, 12]
     assert f"{metrics['psnr']:.2f} dB PSNR" in out
     assert "on 2 test views of 12x12, 50 Gaussians" in out
-    assert err.count("\n") == 3  # a note, and the last state of the progress lines, of steps and test views
+    assert err.count("\n") == 2  # the last state of the progress lines, of steps and test views
     assert err.endswith("2/2 test views measured  0:00 left\n")
     assert f'path = "{scene}"' in (tmp_path / "runs" / "toys-tiny" / "config.toml").read_text()
 

@@ -15,7 +15,6 @@ from lapgs_wgpu.train.presets import (
     config_keys,
     load_config,
     preset_names,
-    rates_that_stay,
     write_toml,
 )
 from lapgs_wgpu.train_options import keys_help
@@ -51,14 +50,6 @@ def test_configuration_survives_toml(name: str, tmp_path: Path) -> None:
     again = load_config(write(tmp_path / "config.toml", write_toml(table)))
     assert again == config
     assert again.field.static.base == (3, 4, 5)
-
-
-def test_learning_rates_that_do_not_follow_the_steps_are_named() -> None:
-    given = {"schedule.steps": 300, "rates.means.steps": 300}
-    told = rates_that_stay(load_config("demo", given), given)
-    assert told.startswith("schedule.steps is 300, and other keys that count steps stay: rates.hash.steps 1500")
-    assert not rates_that_stay(load_config("demo"), {"schedule.steps": 1500})
-    assert not rates_that_stay(load_config("dnerf"), {})
 
 
 def test_every_key_can_be_overridden_and_has_a_help_text() -> None:

@@ -17,7 +17,6 @@ from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.train import density_control, trainer
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.densify import published_rule
 from lapgs_wgpu.train.density_control import contributions
 from lapgs_wgpu.train.optimizer import Optimizer
 from lapgs_wgpu.train.presets import load_config
@@ -59,8 +58,9 @@ def test_pruning_keeps_the_largest_whatever_they_contribute(device: Device, monk
     monkeypatch.setattr(density_control, "contributions", lambda *_, **options: most)
     monkeypatch.setattr(density_control, "LEAST_KEPT", 3)
     optimizer = Optimizer(scene.parameters, {}, config.rates.schedules())
-    data, of = SimpleNamespace(train=shown, extent=1), SimpleNamespace(optimizer=optimizer, camera=lambda v: v.camera)
-    control = density_control.DensityControl(config, scene, of, published_rule, data, torch.Generator())
+    data, camera = SimpleNamespace(train=shown), lambda view: view.camera
+    of = SimpleNamespace(config=config, scene=scene, dataset=data, optimizer=optimizer, camera=camera)
+    control = density_control.DensityControl(of, torch.Generator())
     kept = scene.parameters["means"].detach()[most >= most.sort().values[-3]]
     control.change(4, moving=True)
     assert torch.equal(scene.parameters["means"], kept)

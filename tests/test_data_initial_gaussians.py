@@ -16,7 +16,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterize import Rendering, rasterize
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.start import INITIAL_OPACITY, initial_points
+from lapgs_wgpu.train.setup import INITIAL_OPACITY, initial_points
 
 # A room that eight cameras film from one side.
 CAMERAS = [

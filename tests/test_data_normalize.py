@@ -21,7 +21,7 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.motion.scene import load
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.start import initial_points
+from lapgs_wgpu.train.setup import initial_points
 
 FAR = np.array([100.0, -70.0, 30.0])
 RNG = np.random.default_rng(0)

@@ -37,7 +37,7 @@ from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.image_metrics import differing_pixels
 from lapgs_wgpu.train.optimizer import Optimizer
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.start import max_field_rates
+from lapgs_wgpu.train.setup import max_field_rates
 from lapgs_wgpu.train.trainer import Trainer
 
 RADIUS, BOX = 0.2, 1.3

@@ -13,8 +13,7 @@ from helpers.scenes import front_camera
 from lapgs_wgpu.data import Dataset, View, composite
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.train.ground_truth import GroundTruth, marked_pixels
-from lapgs_wgpu.train.view_order import Draws
+from lapgs_wgpu.train.ground_truth import AHEAD, Draws, GroundTruth, marked_pixels
 
 BLACK = torch.zeros(3)
 
@@ -100,11 +99,12 @@ def test_ignored_pixels_are_marked_and_transparent_ones_count() -> None:
     assert marked_pixels(opaque, BLACK).shape == (2, 3, 3)
 
 
-def test_every_view_is_drawn_once_an_epoch(dataset: Dataset) -> None:
-    draws = Draws(dataset.train, torch.Generator().manual_seed(3))
-    epochs = [[draws.next().name for _ in dataset.train] for _ in range(3)]
-    assert all(sorted(epoch) == sorted(view.name for view in dataset.train) for epoch in epochs)
-    assert epochs[0] != epochs[1]
-    first = draws.next()
-    assert [view.name for view in draws.coming(3)] == [draws.next().name for _ in range(3)]
-    assert first.name not in [view.name for view in draws.coming(100)]
+def test_every_view_is_drawn_once_an_epoch_and_decoded_ahead(dataset: Dataset, device: Device) -> None:
+    with closing(GroundTruth(device, BLACK, 0)) as truth:
+        draws = Draws(dataset.train, torch.Generator().manual_seed(3), truth)
+        epochs = [[draws.next() for _ in dataset.train] for _ in range(3)]
+        assert all(set(epoch) == set(dataset.train) for epoch in epochs)
+        assert epochs[0] != epochs[1]
+        first = draws.next()
+        coming = set(truth._coming)
+        assert coming == {first, *(draws.next() for _ in range(min(AHEAD, len(dataset.train) - 1)))}

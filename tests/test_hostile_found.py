@@ -10,11 +10,12 @@ import sys
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from helpers.damaged_files import FOREIGN, changes_since_without_device, short_config, small_scene, with_table
+from helpers.damaged_files import FOREIGN, short_config, small_scene, with_table
 from helpers.dnerf_scene import make_scene
 from helpers.hostile import refused_or
 from helpers.ply_files import columns_of, ply_bytes, random_still
@@ -30,7 +31,7 @@ from lapgs_wgpu.run import evaluate_run, resume
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.run_folder import STATE, load_state, save_state, start_run_folder
+from lapgs_wgpu.train.run_folder import STATE, check_same_data, load_state, save_state, start_run_folder
 from lapgs_wgpu.train.step_result import Measured, StepResult
 from lapgs_wgpu.train.trainer import Trainer
 
@@ -115,7 +116,7 @@ def test_found_in_states(device: Device, tmp_path: Path) -> None:
 
 def test_found_in_a_run_folder(tmp_path: Path) -> None:
     (tmp_path / "config.toml").write_text('record = "x"\n')
-    assert changes_since_without_device(tmp_path) == []
+    check_same_data(tmp_path, "there", SimpleNamespace(fingerprint="1"))  # type: ignore[arg-type]
 
 
 def test_nothing_is_written_through_a_link(tmp_path: Path) -> None:
@@ -134,8 +135,8 @@ def test_nothing_is_written_through_a_link(tmp_path: Path) -> None:
     for name in ("config.toml", "log.jsonl", STATE):
         (run / name).symlink_to(mine / "file")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lapgs_wgpu.train.run_folder._record", lambda *_: {})
-        start_run_folder(run, load_config("tiny"), None, None)  # type: ignore[arg-type]
+        patch.setattr("lapgs_wgpu.train.run_folder.environment", lambda device: {})
+        start_run_folder(run, load_config("tiny"), SimpleNamespace(is_cpu=False), SimpleNamespace(fingerprint="1"))
     save_state(run, {"training.done": np.array(1)})
     with Log(run / "log.jsonl", 1, terminal=io.StringIO()) as log:
         log.step(StepResult(1, 1, lambda: Measured(0.5, 10.0)), 3)

@@ -183,7 +183,6 @@ def test_a_step_is_that_of_the_rasterizer_and_the_references(
         },
         rel=1e-5,
     )
-    assert done.psnr == pytest.approx(image_metrics.psnr(image, truth), rel=1e-5)
     assert torch.equal(done.radii, drawn.radii)
     assert torch.equal(done.means2d, drawn.means2d)
     expected = gradients(other, RenderLoss(loss, {}, drawn.radii, drawn.means2d))

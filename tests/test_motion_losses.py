@@ -16,7 +16,7 @@ from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation, TimeSamples
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import AccelerationConfig
-from lapgs_wgpu.train.motion_losses import WOBBLE, acceleration_loss, compared_counts, draw_times
+from lapgs_wgpu.train.motion_losses import WOBBLE, acceleration_loss, compared_counts, even_times
 from lapgs_wgpu.train.step_result import Scheduled
 from lapgs_wgpu.train.trainer import Trainer
 
@@ -80,11 +80,10 @@ def test_chosen_rows_move_as_all_do(device: Device) -> None:
 def test_times_lie_half_to_whole_the_reach_apart() -> None:
     generator = torch.Generator().manual_seed(0)
     for _ in range(50):
-        samples = draw_times(20, 40, 0.5, 101, generator)
-        assert len(samples.rows) == 20
-        assert 0.01 <= 0.5 - samples.times[0] <= 0.02
-        assert samples.times[1] - 0.5 == pytest.approx(0.5 - samples.times[0])
-    assert draw_times(20, 40, 0.995, 101, generator).times[1] == 1
+        before, after = even_times(0.5, 101, generator)
+        assert 0.01 <= 0.5 - before <= 0.02
+        assert after - 0.5 == pytest.approx(0.5 - before)
+    assert even_times(0.995, 101, generator)[1] == 1
 
 
 @pytest.mark.parametrize(

@@ -77,7 +77,7 @@ def test_a_bad_gradient_skips_the_step_and_leaves_everything_as_it_was(
         assert progress.skipped.view == dataset.train[before["training.order"][0]].name
         assert "the gradient of log_scales is not finite, or too large" in progress.skipped.what
         after = {name: value.copy() for name, value in training.state().items()}
-        assert same(before, after) == {"training.done", "training.order"}
+        assert same(before, after) == {"training.done", "training.order"} | ({"training.random"} if at == 16 else set())
         np.testing.assert_array_equal(after["training.order"], before["training.order"][1:])
         assert training.step().skipped is None
         assert {"gaussians.means", "adam.means.0.exp_avg", "statistics.views"} <= same(after, training.state())

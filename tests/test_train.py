@@ -31,8 +31,7 @@ from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.parts import Parts
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.setup import resolve_for_dataset, resolve_step
-from lapgs_wgpu.train.start import initial_points
+from lapgs_wgpu.train.setup import initial_points, resolve_for_dataset, resolve_step
 from lapgs_wgpu.train.step_result import Measured, StepResult
 
 

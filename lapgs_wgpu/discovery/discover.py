@@ -30,7 +30,7 @@ from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.morton import morton_order
 from lapgs_wgpu.train.camera_refinement import Corrections
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config
-from lapgs_wgpu.train.start import Start, start_from_points
+from lapgs_wgpu.train.setup import Start, start_from_points
 
 DYNAMICS = 0.5  # standard deviation of the dynamics attribute of a discovered Gaussian, which it shares with its part
 SHEET_DYNAMICS = 2.0  # in place of it: of all sheets, and of the last one's time

@@ -101,9 +101,8 @@ def static_fit(config: Config, dataset: Dataset, device: Device, progress: Calla
             depths.append(np.where(alpha > SOLID, rendering.depth.numpy(force=True) / np.maximum(alpha, SOLID), np.nan))
     corrections = None
     if refinement is not None:
-        known = {before.camera: after.camera for before, after in zip(picked, small, strict=True)}
-        numbers = {n: known[camera] for n, camera in enumerate(dataset.cameras) if camera in known}
-        corrections = refinement.corrections_of(numbers)
+        cameras = {before.camera: after.camera for before, after in zip(picked, small, strict=True)}
+        corrections = {camera: refinement.correction(fitted) for camera, fitted in cameras.items()}
     return StaticFit(training.scene, images, depths or None, corrections)
 
 

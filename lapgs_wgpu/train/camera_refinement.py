@@ -40,9 +40,8 @@ class ScenePoints(NamedTuple):
 
 def scene_points(means: Tensor, opacities: Tensor) -> ScenePoints:
     """At most MOST_POINTS of a scene's Gaussians: means (N, 3), opacities (N,)."""
-    chosen = slice(None, None, -(-len(means) // MOST_POINTS))
-    points, weights = (values.detach()[chosen].double().numpy(force=True) for values in (means, opacities))
-    return ScenePoints(points, weights)
+    spacing = -(-len(means) // MOST_POINTS)
+    return ScenePoints(*(values.detach()[::spacing].double().numpy(force=True) for values in (means, opacities)))
 
 
 def image_motion(camera: Camera, points: ScenePoints, unit: float) -> Array:
@@ -114,19 +113,18 @@ class Pace(NamedTuple):
     kept: float
 
 
-# By the number of a camera, as far as it is known: (6,) rotation vector and shift, world units.
-Corrections = Mapping[int, Array]
+# (6,) rotation vector and shift, world units, of cameras (the same objects).
+Corrections = Mapping[Camera, Array]
 
 
 class CameraRefinement:
     """The corrections of all training cameras, and how they learn.
 
     cameras: distinct ones. extent: distance that counts as 1 in shifts, world units. points: the scene as it is, asked
-    at each step: what moves how far in the image when a camera moves. before: corrections to go on from, at the final
-    learning rate and from the first step on.
+    at each step: what moves how far in the image when a camera moves. before: corrections of some to go on from, at the
+    final learning rate and from the first step on.
 
-    numbers: of the cameras (the same objects). common: (6 C, r) orthonormal: changes of all cameras that no image
-    shows.
+    numbers: of the cameras (the same objects). common: (6 C, r) orthonormal: changes that no image shows.
     """
 
     name = "cameras"
@@ -150,17 +148,16 @@ class CameraRefinement:
         self._settled = torch.zeros(1)
         if before is not None:
             self._settled += 1
-            for number, correction in before.items():
-                self._learnt[number] = torch.from_numpy(correction * _units(1 / extent))
+            for camera, correction in before.items():
+                self._learnt[self.numbers[camera]] = torch.from_numpy(correction * _units(1 / extent))
+
+    def correction(self, camera: Camera) -> Array:
+        """(6,) what one of the cameras is corrected by: rotation vector and shift, world units."""
+        return self._learnt[self.numbers[camera]].numpy() * _units(self.extent)
 
     def refined(self, camera: Camera) -> Camera:
-        """The corrected form of one of the cameras (the same object)."""
-        return changed_camera(camera, self._learnt[self.numbers[camera]].numpy() * _units(self.extent))
-
-    def corrections_of(self, cameras: Mapping[int, Camera]) -> Corrections:
-        """What the cameras (the same objects) are corrected by, under the given numbers."""
-        learnt = self._learnt.numpy() * _units(self.extent)
-        return {number: learnt[self.numbers[camera]] for number, camera in cameras.items()}
+        """The corrected form of one of the cameras."""
+        return changed_camera(camera, self.correction(camera))
 
     def pace(self, step: int) -> Pace | None:
         """How far cameras move in a step, counted from 1; None in steps that move none."""

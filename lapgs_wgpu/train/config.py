@@ -15,12 +15,7 @@ from typing import Any, Literal, NamedTuple, TypeVar
 from lapgs_wgpu.io.dataclass_table import Options, option
 from lapgs_wgpu.motion.fields.config import FieldConfig
 
-Background = Literal["black", "white"]
 BACKGROUND_LEVELS = {"black": 0.0, "white": 1.0}
-Split = Literal["plain", "adaptive"]
-Units = Literal["world", "capture"]
-StepPlace = Literal["auto", "exchange", "resident"]
-RefineCameras = Literal["auto", "on", "off"]
 Table = TypeVar("Table", bound=Options)
 
 
@@ -29,10 +24,10 @@ class DataConfig(Options):
     """The capture."""
 
     size: int = option("longer side of the images, pixels; larger images are downscaled; 0: the original size")
-    background: Background = option("color behind the Gaussians and behind transparent images")
+    background: Literal["black", "white"] = option("color behind the Gaussians and behind transparent images")
     cache_gb: float = option("memory limit for the images that are kept on the device, gigabytes")
     undistort: bool = option("resample images of lenses with distortion or skew to those of a pinhole camera", True)
-    units: Units = option(
+    units: Literal["world", "capture"] = option(
         "length unit of rates.means, smoothness.reach, field.bound and field.unit; capture: that of its files",
         "world",
     )
@@ -104,10 +99,7 @@ class RatesConfig(Options):
     quats: float = option("rotations (quaternions)", at_least=0)
     opacity_logits: float = option("opacities (logits)", at_least=0)
     sh_dc: float = option("base colors (spherical harmonics of degree 0)", at_least=0)
-    sh_rest: float = option(
-        "view-dependent colors (spherical harmonics of degree 1 to 3)",
-        at_least=0,
-    )
+    sh_rest: float = option("view-dependent colors (spherical harmonics of degree 1 to 3)", at_least=0)
     dynamics: float = option("per-Gaussian dynamics attributes", at_least=0)
     hash: Rate = option("the field's hash tables or feature planes")
     mlp: Rate = option("the field's MLP weights, and the motion spectrum's coefficients")
@@ -130,7 +122,7 @@ class DensityConfig(Options):
         "densify Gaussians whose projected center has at least this gradient, its mean length over the images (an "
         "image is 2 units wide)"
     )
-    split: Split = option(
+    split: Literal["plain", "adaptive"] = option(
         "which large Gaussians are split; plain: all; adaptive: those that differ most from their neighbors (the paper)"
     )
     min_opacity: float = option("prune Gaussians with a lower opacity", at_least=0, below=1)
@@ -252,7 +244,7 @@ class ExposureConfig(Options):
 class CamerasConfig(Options):
     """Correction of the training cameras. Has defaults, since older config.toml files lack it."""
 
-    refine: RefineCameras = option(
+    refine: Literal["auto", "on", "off"] = option(
         "correct the training cameras while training; auto: if their poses were estimated from images (COLMAP, "
         "nerfstudio, Polycam, Record3D)",
         "off",
@@ -262,10 +254,6 @@ class CamerasConfig(Options):
     )
     pull: float = option("weight decay of the corrections, relative to the learning rate", 0.1, at_least=0)
     start: int = option("first step that corrects cameras", 300, at_least=1)
-
-    def refines(self, *, own_footage: bool) -> bool:
-        """Whether the training cameras of such a capture are corrected."""
-        return self.refine == "on" or (self.refine == "auto" and own_footage)
 
 
 @dataclass(frozen=True)
@@ -320,7 +308,7 @@ class Config(Options):
         "lower the opacity of thin Gaussians by the factor by which the low-pass filter enlarges them (as in gsplat)",
         False,
     )
-    step_place: StepPlace = option(
+    step_place: Literal["auto", "exchange", "resident"] = option(
         "where a training step is computed; resident: on the device from end to end, where its parameters stay; "
         "exchange: by torch, which exchanges buffers with the device; auto: exchange on CPU devices and for what only "
         "torch computes (fields other than static, grid4d and laplacian), else resident",

@@ -8,21 +8,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from lapgs_wgpu.data.views import Dataset, View, spread_views
+from lapgs_wgpu.data.views import View, spread_views
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.morton import morton_order
 from lapgs_wgpu.splat.rasterize import rasterize
-from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.densify import (
-    LEAST_KEPT,
-    DensityRule,
-    DensityState,
-    Statistics,
-    check_change,
-    largest,
-    reset_opacities,
-)
+from lapgs_wgpu.train.densify import LEAST_KEPT, DensityState, Statistics, check_change, largest, reset_opacities
 from lapgs_wgpu.train.learners import Learners
 
 MOST_VIEWS = 50  # by which Gaussians are pruned
@@ -34,27 +25,17 @@ class DensityControl:
     statistics: of the Gaussians since the last change of their number.
     """
 
-    def __init__(
-        self,
-        config: Config,
-        scene: Scene4D,
-        learners: Learners,
-        rule: DensityRule,
-        dataset: Dataset,
-        generator: torch.Generator,
-    ) -> None:
-        self._config, self._last = config.density, config.schedule.steps
-        self._scene, self._learners, self._optimizer, self._rule = scene, learners, learners.optimizer, rule
-        self._views, self._extent = spread_views(dataset.train, MOST_VIEWS), dataset.extent
-        self._generator = generator
-        self.statistics = Statistics.zeros(len(scene))
+    def __init__(self, learners: Learners, generator: torch.Generator) -> None:
+        self._learners, self._generator = learners, generator
+        self._config, self._scene, self._optimizer = learners.config.density, learners.scene, learners.optimizer
+        self.statistics = Statistics.zeros(len(self._scene))
 
     def change(self, step: int, *, moving: bool) -> None:
         """Make the changes that are planned after this step (counted from 1), with the optimizer's state.
 
         moving: whether the field moves the Gaussians. Raises InputError where no Gaussian would be left.
         """
-        if self._config.prunes_at(step, self._last):
+        if self._config.prunes_at(step, self._learners.config.schedule.steps):
             self._prune_hidden(moving)
         if self._config.changes_at(step):
             self._apply_rule(step)
@@ -65,8 +46,10 @@ class DensityControl:
     def _apply_rule(self, step: int) -> None:
         scene = self._scene
         rows = {name: row.detach() for name, row in scene.parameters.items()}
-        state = DensityState(step, rows, self.statistics, self._config, self._extent, self._generator)
-        change = self._rule(state)
+        extent = self._learners.dataset.extent
+        change = self._learners.parts.density(
+            DensityState(step, rows, self.statistics, self._config, extent, self._generator)
+        )
         check_change(change, rows)
         if not change.keep.any() and len(change.added["means"]) == 0:
             raise InputError(f"no Gaussian is left at step {step}; raise density.max_world_size (0 switches it off).")
@@ -75,7 +58,8 @@ class DensityControl:
         self.statistics = Statistics.zeros(len(scene))
 
     def _prune_hidden(self, moving: bool) -> None:
-        views = [dataclasses.replace(view, camera=self._learners.camera(view)) for view in self._views]
+        shown = spread_views(self._learners.dataset.train, MOST_VIEWS)
+        views = [dataclasses.replace(view, camera=self._learners.camera(view)) for view in shown]
         most = contributions(self._scene, views, moving=moving)
         keep = (most >= self._config.min_contribution) | largest(most, LEAST_KEPT)
         if not keep.all():

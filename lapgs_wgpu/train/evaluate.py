@@ -46,29 +46,26 @@ def evaluate(
 ) -> dict[str, Any]:
     """Render every view and compare: the content of metrics.json.
 
-    background: black or white. folder: where a picture of each view is written, the
-    ground truth beside the rendering and their error, 4 times enlarged; an existing folder. lpips: None where there
-    are no weights for it.
+    background: black or white. folder: where a picture of each view is written, the ground truth beside the rendering
+    and their error, 4 times enlarged; an existing folder. lpips: None where there are no weights for it. progress:
+    takes a step for each view.
+
     Each measure is one of an image, then the mean over the images (of PSNR of the dB): psnr over all channels; ssim,
     that of the loss; ms_ssim; lpips on inputs in [-1, 1], and lpips_unscaled on inputs in [0, 1], as 3DGS's code
-    reports it. Where masks say what moves: psnr_moving and
-    ssim_moving inside them, psnr_still and ssim_still outside, explained the share of the moving pixels that are drawn
-    as they are (`differing_pixels`); a picture off_NAME.png shows such a view from OFF_PATH to the left and right.
-    "not available" stands for what cannot be measured: pictures too small, no weights, no masks, nothing that moves.
-    progress: takes a step for each view.
+    reports it. Where masks say what moves: psnr_moving and ssim_moving inside them, psnr_still and ssim_still outside,
+    explained the share of the moving pixels that are drawn as they are (`differing_pixels`); a picture off_NAME.png
+    shows such a view from OFF_PATH to the left and right. "not available" stands for what cannot be measured.
     Raises InputError where there are no views, or a picture or a mask cannot be read.
     """
     if not views:
         raise InputError("there are no views to measure: most captures have no validation views, only test views.")
     start = time.perf_counter()
     color = torch.full((3,), BACKGROUND_LEVELS[background])
-    rows = []
+    rows: list[dict[str, Any]] = []
     for view in views:
         truth, image = composite(view.load(), color.numpy()), _render(scene, view, color)
-        row: dict[str, Any] = {"view": view.name, "time": view.time}
-        row |= _measures(_unit(image), _unit(truth), lpips)
-        row |= _parts(_unit(image), _unit(truth), None if view.moving is None else view.moving())
-        rows.append(row)
+        moving = None if view.moving is None else view.moving()
+        rows.append({"view": view.name, "time": view.time} | _measures(_unit(image), _unit(truth), moving, lpips))
         if folder is not None:
             with atomic_write(folder / f"{view.name}.png") as file:
                 file.write(encode_png(side_by_side(truth, image)))
@@ -93,22 +90,18 @@ def _render(scene: Scene4D, view: View, color: Tensor) -> NDArray[np.uint8]:
     return to_8_bit(scene.render(view.camera, view.time, color, depth=False).image)
 
 
-def _measures(image: Tensor, truth: Tensor, lpips: Lpips | None) -> dict[str, float | str]:
+def _measures(
+    image: Tensor, truth: Tensor, moving: NDArray[np.bool_] | None, lpips: Lpips | None
+) -> dict[str, float | str]:
     side = min(image.shape[:2])
-    perceptual = lpips if side >= SMALLEST else None
-    return {
-        "psnr": psnr(image, truth),
-        "ssim": float(ssim(image, truth)),
-        "ms_ssim": float(ms_ssim(image, truth)) if side >= MS_SSIM_SMALLEST else NOT_AVAILABLE,
-        "lpips": perceptual(image, truth) if perceptual else NOT_AVAILABLE,
-        "lpips_unscaled": perceptual(image, truth, unscaled=True) if perceptual else NOT_AVAILABLE,
-    }
-
-
-def _parts(image: Tensor, truth: Tensor, moving: NDArray[np.bool_] | None) -> dict[str, float | str]:
+    measures: dict[str, float | str] = dict.fromkeys(MEASURES, NOT_AVAILABLE)
+    measures |= {"psnr": psnr(image, truth), "ssim": float(ssim(image, truth))}
+    if side >= MS_SSIM_SMALLEST:
+        measures["ms_ssim"] = float(ms_ssim(image, truth))
+    if lpips is not None and side >= SMALLEST:
+        measures |= {"lpips": lpips(image, truth), "lpips_unscaled": lpips(image, truth, unscaled=True)}
     if moving is None or not moving.any() or moving.all():
-        return dict.fromkeys(PARTS, NOT_AVAILABLE)
-    measures: dict[str, float | str] = {}
+        return measures
     for name, pixels in (("moving", torch.from_numpy(moving)), ("still", torch.from_numpy(~moving))):
         measures[f"psnr_{name}"] = psnr(image[pixels], truth[pixels])
         measures[f"ssim_{name}"] = float(ssim(image, truth, pixels))

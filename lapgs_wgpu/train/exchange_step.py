@@ -4,66 +4,46 @@ shared, and wherever torch computes a part of the step, such as a field or a los
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
+import torch
 from torch import Tensor
 
-from lapgs_wgpu.data.views import Dataset, View
+from lapgs_wgpu.data.views import View
 from lapgs_wgpu.motion.fields.deformation import Deformed, Nearby, TimeSamples
 from lapgs_wgpu.motion.fields.dynamics import dynamics_loss
-from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.density_control import DensityControl
 from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
-from lapgs_wgpu.train.ground_truth import AHEAD, GroundTruth
+from lapgs_wgpu.train.ground_truth import Draws
+from lapgs_wgpu.train.image_metrics import psnr_of
 from lapgs_wgpu.train.learners import Learners
-from lapgs_wgpu.train.motion_losses import acceleration_loss, compared_counts, draw_nearby, draw_times
-from lapgs_wgpu.train.nonfinite import Skipped, cause, check_parameters, finite
-from lapgs_wgpu.train.parts import LossTerm, Regularizer, weight_at
-from lapgs_wgpu.train.step_result import Measured, Scheduled
-from lapgs_wgpu.train.view_order import Draws
+from lapgs_wgpu.train.motion_losses import acceleration_loss, compared_counts, even_times, near_time
+from lapgs_wgpu.train.parts import Regularizer
+from lapgs_wgpu.train.step_result import Measured, Scheduled, Skipped, cause, check_parameters, finite
 
 
 class ExchangeStep:
-    """Takes the steps of a training: the gradients of a view's loss, then the optimizers.
+    """Takes the steps of a training: the gradients of a view's loss, then the optimizers."""
 
-    own_terms: of the loss, beside those of the configuration (docs/api.md).
-    """
-
-    def __init__(
-        self,
-        config: Config,
-        scene: Scene4D,
-        own_terms: Sequence[LossTerm],
-        dataset: Dataset,
-        learners: Learners,
-        density: DensityControl,
-        truth: GroundTruth,
-        draws: Draws,
-    ) -> None:
-        self._config, self._scene, self._own_terms = config, scene, own_terms
-        self._time_count, self._extent = dataset.moments, dataset.extent
-        self._learners, self._density, self._truth, self._draws = learners, density, truth, draws
+    def __init__(self, learners: Learners, density: DensityControl, draws: Draws) -> None:
+        self._learners, self._density, self._draws = learners, density, draws
+        self._config, self._scene, self._time_count = learners.config, learners.scene, learners.dataset.moments
 
     def take(self, scheduled: Scheduled, began: Callable[[], None]) -> Callable[[], Measured]:
         """Take a step; gives what it told.
 
-        began: called before anything changes, and after the last error that leaves all as it was.
+        began: called before anything changes, after the last error that leaves all as it was.
         Raises NumericalError where a parameter is not finite.
         """
-        step, draws = scheduled.step, self._draws
-        view, drawn = draws.next(), draws.mark()
+        step, view = scheduled.step, self._draws.next()
         compared = self._compared(scheduled, self._scene.timing(view.time))
-        self._truth.prefetch([view, *draws.coming(AHEAD)])
         self._learners.zero_grad()
         measured, rendering = self._descend(scheduled, view, *compared)
         d_means2d = rendering.means2d.grad
         assert d_means2d is not None
-        what = self._not_finite(measured, d_means2d, began)
         began()
-        if what:
+        if what := self._not_finite(measured, d_means2d):
             self._learners.zero_grad()
-            draws.go_back(drawn)
             measured = measured._replace(skipped=Skipped(step, view.name, what))
         else:
             self._learners.step(step, scheduled.share)
@@ -74,38 +54,39 @@ class ExchangeStep:
 
     def _compared(self, scheduled: Scheduled, t: float) -> tuple[Nearby | None, TimeSamples | None]:
         """Draw what the losses of motion compare at a time of the field, None for each that is off."""
-        config, count, generator = self._config, len(self._scene), self._draws.generator
-        near, even = compared_counts(config, scheduled, count, self._time_count, fitted=self._learners.field_fitted > 0)
-        nearby = draw_nearby(config.smoothness, near, count, t, generator) if near else None
-        if not even or self._scene.field is None:
-            return nearby, None
-        return nearby, draw_times(even, count, t, self._time_count, generator)
+        config, count, generator, times = self._config, len(self._scene), self._draws.generator, self._time_count
+        near, even = compared_counts(config, scheduled, count, times, fitted=self._learners.field_fitted > 0)
+        nearby = time_samples = None
+        if near:
+            smooth, rows = config.smoothness, torch.randint(count, (near,), generator=generator)
+            offsets = smooth.reach * (2 * torch.rand(near, 3, generator=generator) - 1)
+            nearby = Nearby(rows, offsets, near_time(smooth, t, generator), smooth.static, smooth.temporal)
+        if even and self._scene.field is not None:
+            rows = torch.randint(count, (even,), generator=generator)
+            time_samples = TimeSamples(rows, even_times(t, times, generator))
+        return nearby, time_samples
 
     def _descend(
-        self,
-        scheduled: Scheduled,
-        view: View,
-        nearby: Nearby | None,
-        time_samples: TimeSamples | None,
+        self, scheduled: Scheduled, view: View, nearby: Nearby | None, time_samples: TimeSamples | None
     ) -> tuple[Measured, RenderLoss]:
         """Add the gradients of a view's loss to those of all that learns."""
         config, scene, moving = self._config, self._scene, scheduled.moving
-        learners = self._learners
+        learners, truth = self._learners, self._draws.truth
         now = scene.deformed(view.time, nearby, time_samples) if moving else Deformed(scene.canonical(), None, [])
         weights = config.loss.weights(warm=moving)
-        weighted = [(term, weight) for term in self._own_terms if (weight := weight_at(term, scheduled.step))]
+        weighted = [(term, weight) for term in learners.parts.losses if (weight := term.weight_at(scheduled.step))]
         of_image = [(term, weight) for term, weight in weighted if not isinstance(term, Regularizer)]
         rendering = render_loss(
             now.gaussians,
             learners.camera(view),
-            self._truth.on_device(view),
-            self._truth.color,
+            truth.on_device(view),
+            truth.color,
             weights,
             scene.device,
             learners.exposure(view),
             of_image,
             learners.camera_change(view),
-            self._extent,
+            learners.dataset.extent,
         )
         of_motion: dict[str, Tensor] = {}
         if now.smoothness is not None:
@@ -125,9 +106,9 @@ class ExchangeStep:
         factors = {**weights._asdict(), **{term.name: weight for term, weight in of_image}}
         terms = {name: factors[name] * value for name, value in rendering.terms.items() if name in factors}
         terms |= {name: value.item() for name, value in of_motion.items()}
-        return Measured(loss.item(), rendering.psnr, terms=terms), rendering
+        return Measured(loss.item(), psnr_of(rendering.terms["mse"]), terms=terms), rendering
 
-    def _not_finite(self, measured: Measured, d_means2d: Tensor, began: Callable[[], None]) -> str:
+    def _not_finite(self, measured: Measured, d_means2d: Tensor) -> str:
         """What is not finite in the loss and gradients of a step, for which it is skipped; "" where all is well.
 
         Raises NumericalError for a parameter, whose values a step cannot mend.
@@ -136,9 +117,5 @@ class ExchangeStep:
         gradients["the places in the image"] = [d_means2d]
         if math.isfinite(measured.loss) and finite(parameters, gradients):
             return ""
-        try:
-            check_parameters(parameters)
-        except Exception:
-            began()
-            raise
+        check_parameters(parameters)
         return cause(measured.terms, gradients)

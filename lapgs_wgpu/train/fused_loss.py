@@ -20,8 +20,7 @@ from lapgs_wgpu.splat.rasterize import gradient_tensors, radii_and_centres, rast
 from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.exposure import ExposurePasses
 from lapgs_wgpu.train.image_loss import ImageLoss
-from lapgs_wgpu.train.image_metrics import psnr_of
-from lapgs_wgpu.train.parts import TorchLoss, torch_loss
+from lapgs_wgpu.train.parts import LossTerm, torch_loss
 
 
 class RenderLoss(NamedTuple):
@@ -37,11 +36,6 @@ class RenderLoss(NamedTuple):
     radii: Tensor
     means2d: Tensor
 
-    @property
-    def psnr(self) -> float:
-        """In dB over all pixels and channels, at most 100 dB."""
-        return psnr_of(self.terms["mse"])
-
 
 # The passes of a device, whose buffers serve all calls of `render_loss`.
 image_loss_of, exposure_of = functools.cache(ImageLoss), functools.cache(ExposurePasses)
@@ -55,13 +49,14 @@ def render_loss(
     weights: LossWeights,
     device: Device,
     correction: Tensor | None = None,
-    own: Sequence[tuple[TorchLoss, float]] = (),
+    own: Sequence[tuple[LossTerm, float]] = (),
     camera_change: Tensor | None = None,
     camera_unit: float = 1.0,
 ) -> RenderLoss:
     """The weighted sum of the image losses of the rendered Gaussians, computed on the device from end to end.
 
-    The same bits on every run of one adapter and driver. The gradients are always computed.
+    All passes are submitted at once, those of the gradients, too, and one read-back brings what the host needs. The
+    same bits on every run of one adapter and driver.
 
     gaussians: activated, float32, with harmonics. truth: (H, W) as `upload_rgba` leaves it, of the camera's size.
     background: (3,) in [0, 1], under the rendering; not differentiable. correction: (3, 4) of the image's colors before
@@ -69,70 +64,61 @@ def render_loss(
     which get the gradient by a small change of the camera: rotation, shift in units of `camera_unit`, world units
     (splat.drawing.CameraGradient).
     """
-    probe = gaussians.means.new_empty((len(gaussians), 2)).requires_grad_()
-    differentiable = *gaussians.arrays().values(), correction, camera_change, probe
-    given = gaussians.antialiased, camera, camera_unit, truth, tuple(background.tolist()), weights, device, own
-    loss, computed, radii, centres = _FusedLoss.apply(*differentiable, given)
-    probe.data = centres
+    rasterizer, losses, exposing = rasterizer_of(device), image_loss_of(device), exposure_of(device)
+    arrays, (red, green, blue) = upload_gaussians(rasterizer.pool, gaussians), background.tolist()
+    corrections = None if correction is None else upload(exposing.pool, "correction", correction)
+    while True:
+        drawing = rasterizer.draw(arrays, camera, (red, green, blue), gradient=True)
+        with Commands(device) as commands:
+            image = drawing.image if corrections is None else exposing.record(commands, drawing.image, corrections)
+            sums, d_image = losses.record(commands, image, truth, weights)
+        own_values = []
+        for term, weight in own:
+            value, gradient = torch_loss(term, image, truth, weight)
+            own_values.append(value)
+            d_image.write(d_image.read() + gradient)
+        rows = []
+        if corrections is not None:
+            with Commands(device) as commands:
+                d_image, d_correction = exposing.record_bwd(commands, drawing.image, d_image, corrections)
+            rows.append(d_correction)
+        back = rasterizer.backward(drawing, d_image, camera=camera_change is not None)
+        rows += [] if back.camera is None else [back.camera]
+        found = iter(read_all([sums, drawing.splats, *back.arrays(), *rows, *drawing.needed]))
+        values, splats, d_gaussians = next(found), next(found), [next(found) for _ in back.arrays()]
+        d_rows = [next(found) for _ in rows]
+        # Where the intersections did not fit, none of this is right, and all of it is done again.
+        if not rasterizer.grow_on_overflow(drawing, list(found)):
+            break
+    by_gaussians, d_means2d = gradient_tensors(d_gaussians, gaussians.opacities.detach())
+    by_correction = by_camera = None
+    if correction is not None:
+        by_correction = correction.new_tensor(d_rows[0].sum(axis=0, dtype=np.float64))
+    if camera_change is not None:
+        by = camera_gradient(d_rows[-1])
+        by_camera = camera_change.new_tensor([*by.rotation, *(camera_unit * by.position)])
+    radii, means2d = radii_and_centres(splats, gaussians.means.device)
+    means2d.requires_grad_()
+    computed = np.append(values.astype(np.float64), own_values)
+    factors = [weights.l1, 0, weights.ssim, weights.pyramid, weights.ncc, *(weight for _, weight in own)]
+    gradients = (*by_gaussians, by_correction, by_camera, d_means2d)
+    differentiable = (*gaussians.arrays().values(), correction, camera_change, means2d)
+    loss = _Computed.apply(float(np.dot(computed, factors)), gradients, *differentiable)
     names = ("l1", "mse", "ssim", "pyramid", "ncc", *(term.name for term, _ in own))
     used = (True, True, weights.ssim, weights.pyramid, weights.ncc, *[True] * len(own))
     terms = {name: value for name, value, use in zip(names, computed.tolist(), used, strict=True) if use}
-    return RenderLoss(loss, terms, radii, probe)
+    return RenderLoss(loss, terms, radii, means2d)
 
 
-class _FusedLoss(torch.autograd.Function):
-    """The loss, whose gradients are computed together with it.
-
-    apply(means, quats, scales, opacities, sh, correction, change, probe, given): probe (N, 2) takes the gradient by the
-    projected means; given is what else `render_loss` was given. forward submits all passes at once, and one read-back
-    brings what the host needs; backward multiplies the gradients that are then already there.
-    """
+class _Computed(torch.autograd.Function):
+    """A number whose gradients by some tensors are known: apply(number, gradients, *tensors)."""
 
     @staticmethod
-    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
-        *leaves, correction, change, probe, given = arguments
-        antialiased, camera, unit, truth, background, weights, device, own = given
-        rasterizer, losses, exposing = rasterizer_of(device), image_loss_of(device), exposure_of(device)
-        gaussians = upload_gaussians(rasterizer.pool, Gaussians(*leaves, antialiased=antialiased))
-        corrections = None if correction is None else upload(exposing.pool, "correction", correction)
-        while True:
-            drawing = rasterizer.draw(gaussians, camera, background, gradient=True)
-            d_rows = []
-            with Commands(device) as commands:
-                image = drawing.image if corrections is None else exposing.record(commands, drawing.image, corrections)
-                terms, d_image = losses.record(commands, image, truth, weights)
-            own_values = []
-            for term, weight in own:
-                value, gradient = torch_loss(term, image, truth, weight)
-                own_values.append(value)
-                d_image.write(d_image.read() + gradient)
-            if corrections is not None:
-                with Commands(device) as commands:
-                    d_image, d_correction = exposing.record_bwd(commands, drawing.image, d_image, corrections)
-                    d_rows = [d_correction]
-            back = rasterizer.backward(drawing, d_image, camera=change is not None)
-            d_gaussians = back.arrays()
-            d_rows += [] if back.camera is None else [back.camera]
-            found = iter(read_all([terms, drawing.splats, *d_gaussians, *d_rows, *drawing.needed]))
-            values, splats, gradients = next(found), next(found), [next(found) for _ in d_gaussians]
-            rows = [next(found) for _ in d_rows]
-            # Where the intersections did not fit, none of this is right, and all of it is done again.
-            if not rasterizer.grow_on_overflow(drawing, list(found)):
-                break
-        by_gaussians, d_means2d = gradient_tensors(gradients, leaves[3])
-        by_correction = None if correction is None else correction.new_tensor(rows[0].sum(axis=0, dtype=np.float64))
-        by_camera = None
-        if change is not None:
-            by = camera_gradient(rows[-1])
-            by_camera = change.new_tensor([*by.rotation, *(unit * by.position)])
-        ctx.gradients = (*by_gaussians, by_correction, by_camera, d_means2d)
-        computed = torch.from_numpy(np.append(values.astype(np.float64), own_values))
-        radii, centres = radii_and_centres(splats, probe.device)
-        ctx.mark_non_differentiable(computed, radii, centres)
-        factors = [weights.l1, 0, weights.ssim, weights.pyramid, weights.ncc, *(weight for _, weight in own)]
-        return probe.new_tensor(float(np.dot(computed.numpy(), factors))), computed, radii, centres
+    def forward(ctx: Any, value: float, gradients: tuple[Tensor | None, ...], *tensors: Tensor | None) -> Tensor:
+        ctx.gradients = gradients
+        return torch.tensor(value)
 
     @staticmethod
     def backward(ctx: Any, *d_outputs: Any) -> tuple[Tensor | None, ...]:
         scaled = (None if gradient is None else d_outputs[0] * gradient for gradient in ctx.gradients)
-        return (*scaled, None)
+        return (None, None, *scaled)

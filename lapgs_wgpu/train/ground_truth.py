@@ -1,4 +1,4 @@
-"""The images that a training compares its renderings with: decoded, composited and kept in one place.
+"""The images that a training compares its renderings with: in which order, decoded, composited and kept in one place.
 
 The host prepares an image once: it composites it over the background and marks the pixels that the losses leave out.
 The image then stays on the device; the host reads it back where it needs it.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections import OrderedDict
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -22,8 +22,8 @@ from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 
 DECODERS = min(4, os.cpu_count() or 1)  # threads that decode images before they are needed
-
 AHEAD = 8  # images that are decoded before they are needed
+Mark = tuple[Tensor, list[int]]  # where draws stand: the generator's state, and the views that are left of an epoch
 
 
 class GroundTruth:
@@ -73,6 +73,35 @@ class GroundTruth:
         self._threads.shutdown(cancel_futures=True)
         self._coming.clear()
         self._kept.clear()
+
+
+class Draws:
+    """What the steps of a training draw: views in random order without replacement, epoch after epoch.
+
+    generator: of whatever else they draw. truth: the images. left: the numbers of the views that are still to come in
+    this epoch.
+    """
+
+    def __init__(self, views: Sequence[View], generator: torch.Generator, truth: GroundTruth) -> None:
+        self._views, self.generator, self.truth = views, generator, truth
+        self.left: list[int] = []
+
+    def next(self) -> View:
+        """The next view, whose image, and those after it in this epoch, are decoded meanwhile."""
+        if not self.left:
+            self.left = torch.randperm(len(self._views), generator=self.generator).tolist()
+        self.truth.prefetch(self._views[number] for number in self.left[: AHEAD + 1])
+        return self._views[self.left.pop(0)]
+
+    def mark(self) -> Mark:
+        """Where they stand, for `go_back`."""
+        return self.generator.get_state(), list(self.left)
+
+    def go_back(self, mark: Mark) -> None:
+        """Draw again what was drawn since."""
+        random, left = mark
+        self.generator.set_state(random)
+        self.left = list(left)
 
 
 class HostImage(NamedTuple):

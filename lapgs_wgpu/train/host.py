@@ -16,8 +16,6 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # glibc's malloc.h
-_LARGEST = 2**31 - 1
-_LARGEST_THRESHOLD = 1 << 25  # that glibc takes
 SMALL_WIDTH = 64  # of a decoder whose operators are too short to share
 
 
@@ -51,20 +49,19 @@ def keep_freed_memory() -> None:
     every page anew, which took most of the time of torch's part on a CPU. Larger ones, of which a step has few, still
     go back: kept, they would leave holes that nothing fits into. Other C libraries are left alone.
     """
-    if _is_glibc():
-        library = ctypes.CDLL(None)
-        library.mallopt(_M_MMAP_THRESHOLD, _LARGEST_THRESHOLD)
-        library.mallopt(_M_TRIM_THRESHOLD, _LARGEST)
+    if library := _glibc():
+        library.mallopt(_M_MMAP_THRESHOLD, 1 << 25)  # the largest that it takes
+        library.mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)
 
 
 def return_freed_memory() -> None:
     """Give the system back what `keep_freed_memory` kept: what follows asks for blocks of other sizes."""
-    if _is_glibc():
-        ctypes.CDLL(None).malloc_trim(0)
+    if library := _glibc():
+        library.malloc_trim(0)
 
 
-def _is_glibc() -> bool:
-    return sys.platform == "linux" and platform.libc_ver()[0] == "glibc"
+def _glibc() -> ctypes.CDLL | None:
+    return ctypes.CDLL(None) if sys.platform == "linux" and platform.libc_ver()[0] == "glibc" else None
 
 
 def environment(device: Device) -> dict[str, str]:

@@ -6,8 +6,6 @@ device.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from lapgs_wgpu.gpu.array import DeviceArray
@@ -18,6 +16,7 @@ from lapgs_wgpu.train.config import LossWeights
 
 TERMS = 5  # in the buffer that `record` leaves
 PYRAMID_BANDS = 3  # band-pass levels; below them lies the residual
+DIVISIBLE = 3  # pixels of a level's shorter side, which reflection needs
 NCC_WINDOW = 11
 _WHOLE = 1 << 14  # a lane takes a whole row or column, of a longer side several runs
 
@@ -25,11 +24,11 @@ _WHOLE = 1 << 14  # a lane takes a whole row or column, of a longer side several
 def pyramid_sizes(height: int, width: int) -> list[tuple[int, int]]:
     """(height, width) of each level, the finest first, the residual last: halves, rounded up.
 
-    A level is only divided further where both sides are at least 3 pixels, which reflection needs: small images have
-    fewer band-pass levels, and the smallest are nothing but a residual.
+    A level is only divided further where reflection has the pixels it needs: small images have fewer band-pass levels,
+    and for those that cannot be divided at all the loss is 0.
     """
     sizes = [(height, width)]
-    while len(sizes) <= PYRAMID_BANDS and min(sizes[-1]) >= 3:
+    while len(sizes) <= PYRAMID_BANDS and min(sizes[-1]) >= DIVISIBLE:
         sizes.append(((sizes[-1][0] + 1) // 2, (sizes[-1][1] + 1) // 2))
     return sizes
 
@@ -54,11 +53,7 @@ class ImageLoss:
         self._lanes, self._run = (8, _WHOLE) if device.is_cpu else (64, 64)
 
     def record(
-        self,
-        commands: Commands,
-        image: DeviceArray,
-        truth: DeviceArray,
-        weights: LossWeights,
+        self, commands: Commands, image: DeviceArray, truth: DeviceArray, weights: LossWeights
     ) -> tuple[DeviceArray, DeviceArray]:
         """Compare an image with its ground truth.
 
@@ -74,13 +69,11 @@ class ImageLoss:
         extra = {}
         if weights.ssim:
             extra["ssim"] = frame.ssim(pixels)
-        correlated = frame.ncc_forward(pixels) if frame.ncc_windows else None
-        levels = frame.pyramid_forward(pixels)
+        if frame.ncc_windows:
+            extra["ncc"] = frame.ncc(pixels)
+        if frame.sizes:
+            extra["pyramid"] = frame.pyramid(pixels)
         terms = frame.sum_up()
-        if correlated:
-            extra["ncc"] = frame.ncc_backward({"pixels": pixels, **correlated})
-        if levels:
-            extra["pyramid"] = frame.pyramid_backward(levels)
         arrays = {"pixels": pixels, "d_image": self.pool.array("d_image", (4, height, width)), **extra}
         flags = {name.upper(): 1 for name in extra}
         frame.run("loss_gradient", frame.grid(width, height, channels=3), arrays, **flags)
@@ -91,35 +84,17 @@ class ImageLoss:
         return self.pool.array("truth", truth.shape, "uint32")
 
 
-class _Level(NamedTuple):
-    """Two neighbouring levels of the pyramid: their uniform, the coarse one's values, the fine band's signs."""
-
-    uniform: DeviceArray
-    coarse: DeviceArray
-    signs: DeviceArray
-
-
 class _Frame:
-    def __init__(
-        self,
-        owner: ImageLoss,
-        commands: Commands,
-        height: int,
-        width: int,
-        weights: LossWeights,
-    ) -> None:
+    """The passes of an image; those of a loss return its gradient. ncc_windows, sizes: 0 and empty without the loss."""
+
+    def __init__(self, owner: ImageLoss, commands: Commands, height: int, width: int, weights: LossWeights) -> None:
         self.owner, self.commands, self.weights = owner, commands, weights
         self.height, self.width = height, width
         # With what fills up strips of 8 columns, or of 8 rows: common/picture.wgsl.
         self.places, self.places_across = (width + 7) // 8 * 8 * height, (height + 7) // 8 * 8 * width
-        fits = min(height, width) >= NCC_WINDOW
         margin = NCC_WINDOW - 1
-        self.ncc_windows = (height - margin) * (width - margin) if weights.ncc and fits else 0
-        # One level is all residual: the pyramid's loss is then L1.
-        sizes = pyramid_sizes(height, width) if weights.pyramid else []
-        self.sizes = sizes if len(sizes) > 1 else []
-        self.flat_pyramid = weights.pyramid if len(sizes) == 1 else 0.0
-        self.level_weights = pyramid_weights(len(sizes))
+        self.ncc_windows = max(height - margin, 0) * max(width - margin, 0) if weights.ncc else 0
+        self.sizes = pyramid_sizes(height, width) if weights.pyramid and min(height, width) >= DIVISIBLE else []
 
         # How many lanes leave partial sums, a term after the other.
         rows = self.runs(width) * height
@@ -131,9 +106,8 @@ class _Frame:
 
         pixel = 1.0 / (3 * height * width)
         window = 1.0 / max(1, self.ncc_windows)
-        per_pixel = window / NCC_WINDOW**2
         kernel = Kernel.get(owner.device, "loss_pixels", LANES=owner._lanes)
-        slope = (weights.l1 + self.flat_pyramid) * pixel, weights.ssim * pixel, weights.ncc * per_pixel, 0.0
+        slope = weights.l1 * pixel, weights.ssim * pixel, weights.ncc * (window / NCC_WINDOW**2), 0.0
         given = {"size": (width, height), "run": owner._run, "slope": slope}
         given |= {"ssim_first": self.ends[1], "ncc_first": self.ends[3], "value": (pixel, pixel, window, 0.0)}
         self.picture = owner.pool.varying("picture", lambda: kernel.uniform("Picture", **given))
@@ -160,7 +134,7 @@ class _Frame:
         return pixels
 
     def ssim(self, pixels: DeviceArray) -> DeviceArray:
-        """The derivatives, blurred along the rows."""
+        """By the blurs; blurred along the rows."""
         moments = self.owner.pool.array("ssim moments", (3, self.places_across, 4))
         slopes = self.owner.pool.array("ssim slopes", (3, self.places, 4))
         arrays = {"pixels": pixels, "moments": moments, "slopes": slopes}
@@ -168,34 +142,26 @@ class _Frame:
         self.run("loss_ssim_across", self.grid(self.height, self.width, channels=3), arrays)
         return slopes
 
-    def ncc_forward(self, pixels: DeviceArray) -> dict[str, DeviceArray]:
-        """Moments of pixels below each other, and slopes, the derivatives, summed over the windows along the rows."""
+    def ncc(self, pixels: DeviceArray) -> DeviceArray:
+        """By the luminance. moments: of pixels below each other; slopes: the derivatives, summed along the rows."""
         pool, rows = self.owner.pool, self.height - NCC_WINDOW + 1
-        found = {name: pool.array(f"ncc {name}", (self.places, 4)) for name in ("moments", "slopes")}
-        arrays = {**found, "pixels": pixels, "truth_variances": pool.array("ncc truth variances", (self.places,))}
+        arrays = {name: pool.array(f"ncc {name}", (self.places, 4)) for name in ("moments", "slopes")}
+        arrays |= {"pixels": pixels, "truth_variances": pool.array("ncc truth variances", (self.places,))}
+        arrays["d_luminance"] = pool.array("d_luminance", (self.places,))
         self.run("loss_ncc_down", self.grid(self.width, rows), arrays)
         self.run("loss_ncc_across", self.grid(rows, self.width), arrays)
-        return found
+        self.run("loss_ncc_up", self.grid(self.width, self.height), arrays)
+        return arrays["d_luminance"]
 
-    def ncc_backward(self, arrays: dict[str, DeviceArray]) -> DeviceArray:
-        """The gradient by the luminance. arrays: the pixels, and what `ncc_forward` gave."""
-        d_luminance = self.owner.pool.array("d_luminance", (self.places,))
-        self.run("loss_ncc_up", self.grid(self.width, self.height), arrays | {"d_luminance": d_luminance})
-        return d_luminance
-
-    def pyramid_forward(self, pixels: DeviceArray) -> list[_Level]:
-        """The levels, from the finest on; none where the pyramid is not used, or nothing but a residual."""
-        owner, levels = self.owner, list[_Level]()
-        shares = [
-            weight / (3 * height * width)
-            for weight, (height, width) in zip(self.level_weights, self.sizes, strict=False)
-        ]
-        first, fine = self.ends[2], pixels
-        bands = len(self.sizes) - 1
+    def pyramid(self, pixels: DeviceArray) -> DeviceArray:
+        """By the difference: down to the residual, and from there up."""
+        owner, pool, bands = self.owner, self.owner.pool, len(self.sizes) - 1
+        weights = zip(pyramid_weights(bands + 1), self.sizes, strict=True)
+        shares = [weight / (3 * height * width) for weight, (height, width) in weights]
+        first, fine, levels = self.ends[2], pixels, list[dict[str, DeviceArray]]()
         for k in range(bands):
             (fine_height, fine_width), (height, width) = self.sizes[k : k + 2]
-            finest = {"FINEST": 1} if k == 0 else {}
-            residual = {"RESIDUAL": 1} if k == bands - 1 else {}
+            finest, residual = {"FINEST": 1} if k == 0 else {}, {"RESIDUAL": 1} if k == bands - 1 else {}
             content = Kernel.get(owner.device, "loss_pyramid_band", LANES=owner._lanes, **finest, **residual).uniform(
                 "Level",
                 fine=(fine_width, fine_height),
@@ -207,44 +173,34 @@ class _Frame:
                 coarse_value=shares[k + 1],
                 coarse_slope=shares[k + 1] * self.weights.pyramid,
             )
-            level = _Level(
-                owner.pool.constant(content),
-                owner.pool.array(f"level {k + 1}", (height, width, 4)),
-                owner.pool.array(f"signs {k}", (fine_height, fine_width), "uint32"),
-            )
-            arrays = {"level": level.uniform, "fine": fine, "coarse": level.coarse, "signs": level.signs}
-            self.run("loss_pyramid_reduce", (-(-width // owner._lanes), height), arrays, **finest)
-            self.run("loss_pyramid_band", self.grid(width, height), arrays, **finest, **residual)
+            level = {"level": pool.constant(content), "fine": fine}
+            level["coarse"] = pool.array(f"level {k + 1}", (height, width, 4))
+            level["signs"] = pool.array(f"signs {k}", (fine_height, fine_width), "uint32")
+            self.run("loss_pyramid_reduce", (-(-width // owner._lanes), height), level, **finest)
+            self.run("loss_pyramid_band", self.grid(width, height), level, **finest, **residual)
             levels.append(level)
             first += self.pyramid_counts[k]
-            fine = level.coarse
-        return levels
-
-    def pyramid_backward(self, levels: list[_Level]) -> DeviceArray:
-        """The gradient by the difference, from the residual up."""
-        owner, arrays = self.owner, dict[str, DeviceArray]()
-        for k in range(len(levels), 0, -1):
+            fine = level["coarse"]
+        arrays = {"difference": fine}
+        for k in range(bands, 0, -1):
             height, width = self.sizes[k]
-            d_level = owner.pool.array(f"d_level {k}", (height, width, 4))
-            arrays |= {"above": levels[k - 1].uniform, "fine_signs": levels[k - 1].signs, "d_level": d_level}
-            if k == len(levels):
-                arrays["difference"] = levels[-1].coarse
-            else:
-                arrays |= {"below": levels[k].uniform, "signs": levels[k].signs}
-            residual = {"RESIDUAL": 1} if k == len(levels) else {}
+            above, residual = levels[k - 1], {"RESIDUAL": 1} if k == bands else {}
+            arrays |= {"above": above["level"], "fine_signs": above["signs"]}
+            arrays["d_level"] = pool.array(f"d_level {k}", (height, width, 4))
+            if not residual:
+                arrays |= {"below": levels[k]["level"], "signs": levels[k]["signs"]}
             self.run("loss_pyramid_bwd", (-(-width // owner._lanes), height), arrays, **residual)
-            arrays["d_coarse"] = d_level
-        arrays |= {"level": levels[0].uniform, "signs": levels[0].signs}
-        arrays["d_difference"] = owner.pool.array("d_difference", (self.places, 4))
+            arrays["d_coarse"] = arrays["d_level"]
+        arrays |= {"level": levels[0]["level"], "signs": levels[0]["signs"]}
+        arrays["d_difference"] = pool.array("d_difference", (self.places, 4))
         height, width = self.sizes[1]
         self.run("loss_pyramid_finest", (-(-width // owner._lanes), height), arrays, FINEST=1)
         return arrays["d_difference"]
 
     def sum_up(self) -> DeviceArray:
+        """The terms."""
         names = ("l1", "squared", "ssim", "pyramid", "ncc")
         parts = dict(zip(names, zip([0, *self.ends], self.ends, strict=False), strict=True))
-        if self.flat_pyramid:
-            parts["pyramid"] = parts["l1"]
         kernel = Kernel.get(self.owner.device, "loss_sums", LANES=self.owner._lanes)
         arrays = {"parts": self.owner.pool.constant(kernel.uniform("Parts", **parts))}
         arrays["terms"] = self.owner.pool.array("terms", (TERMS,))

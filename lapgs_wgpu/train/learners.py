@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor
@@ -12,25 +12,23 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.camera_refinement import CameraRefinement, ScenePoints, scene_points
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.exposure import Exposures
-from lapgs_wgpu.train.nonfinite import Tensors
 from lapgs_wgpu.train.optimizer import FrequencyOptimizer, Optimizer
 from lapgs_wgpu.train.parts import Parts
-from lapgs_wgpu.train.setup import nyquist_frequency
-from lapgs_wgpu.train.start import Start, max_field_rates
-
-Refiner = FrequencyOptimizer | Exposures | CameraRefinement
+from lapgs_wgpu.train.setup import Start, max_field_rates, nyquist_frequency
+from lapgs_wgpu.train.step_result import Tensors
 
 
 class Learners:
     """The optimizer of the Gaussians and the field, and what learns beside it.
 
-    frequencies: of the motion spectrum; None where there is none. image_numbers: by name of a training view the number
-    of its colors' correction. on_access: called before corrections are read or changed from outside: a device may have
-    newer ones.
+    config, dataset, parts, scene: of the training. frequencies: of the motion spectrum; None where there is none.
+    image_numbers: by name of a training view the number of its colors' correction. on_access: called before corrections
+    are read or changed from outside: a device may have newer ones.
     """
 
     def __init__(self, config: Config, dataset: Dataset, parts: Parts, start: Start) -> None:
-        scene = start.scene
+        self.config, self.dataset, self.parts = config, dataset, parts
+        scene = self.scene = start.scene
         self._groups = scene.field.parameter_groups() if scene.field else {}
         rates = parts.rates_of(config.rates.schedules(), scene.parameters, self._groups)
         self.optimizer = Optimizer(scene.parameters, self._groups, rates)
@@ -43,7 +41,7 @@ class Learners:
         if config.exposure.enabled:
             count = len(dataset.cameras) if dataset.is_rig else len(dataset.train)
             self._exposures = Exposures(count, config.exposure.rate)
-        if config.cameras.refines(own_footage=dataset.own_footage):
+        if config.cameras.refine == "on" or (config.cameras.refine == "auto" and dataset.own_footage):
 
             def points() -> ScenePoints:
                 return scene_points(scene.parameters["means"], scene.parameters["opacity_logits"].sigmoid())
@@ -117,10 +115,8 @@ class Learners:
         for each in self._refiners():
             restore_tensors(each.state(), state[each.name], each.name)
 
-    def _refiners(self) -> Iterator[Refiner]:
-        for each in (self.frequencies, self.exposures, self.cameras):
-            if each is not None:
-                yield each
+    def _refiners(self) -> list[FrequencyOptimizer | Exposures | CameraRefinement]:
+        return [each for each in (self.frequencies, self.exposures, self.cameras) if each is not None]
 
 
 @torch.no_grad()

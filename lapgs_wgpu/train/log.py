@@ -106,8 +106,7 @@ class Log:
         }
 
     def _progress_line(self, step: int, gaussians: int) -> str:
-        psnr = sum(each.psnr for each in self._recent) / len(self._recent)
-        rate = self._steps_per_second()
+        psnr, rate = self._means()["psnr"], self._steps_per_second()
         known = len(self._times) > 1 or step == self._steps
         left = duration((self._steps - step) / rate) if known else "?"
         return f"step {step}/{self._steps}  {psnr:5.2f} dB  {gaussians} Gaussians  {rate:.1f} steps/s  {left} left"

@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lapgs_wgpu.motion.fields.deformation import Deformed, Nearby, TimeSamples
+from lapgs_wgpu.motion.fields.deformation import Deformed, TimeSamples
 from lapgs_wgpu.train.config import Config, SmoothnessConfig
 from lapgs_wgpu.train.step_result import Scheduled
 
@@ -37,29 +37,14 @@ def compared_counts(
     return near_count, 0 if left_out else round(even.share * count)
 
 
-def draw_nearby(config: SmoothnessConfig, chosen: int, count: int, t: float, generator: torch.Generator) -> Nearby:
-    """At which `chosen` of `count` Gaussians the field is compared with itself in a step at time t."""
-    rows = torch.randint(count, (chosen,), generator=generator)
-    offsets = config.reach * (2 * torch.rand(chosen, 3, generator=generator) - 1)
-    return Nearby(rows, offsets, near_time(config, t, generator), config.static, config.temporal)
-
-
 def near_time(config: SmoothnessConfig, t: float, generator: torch.Generator) -> float:
-    """Draw the other time at which the field is looked at."""
+    """Draw the time at which the field is compared with itself at time t."""
     return min(max(t + config.time_reach * (2 * float(torch.rand((), generator=generator)) - 1), 0.0), 1.0)
 
 
-def draw_times(chosen: int, count: int, t: float, time_count: int, generator: torch.Generator) -> TimeSamples:
-    """Draw the times before and after t at which the acceleration loss looks, at `chosen` of `count` Gaussians.
-
-    At an end of the clip one of the times is t itself, and the loss is 0.
-    """
-    rows = torch.randint(count, (chosen,), generator=generator)
-    return TimeSamples(rows, even_times(t, time_count, generator))
-
-
 def even_times(t: float, time_count: int, generator: torch.Generator) -> tuple[float, float]:
-    """Draw the times before and after t."""
+    """Draw the times before and after t at which the acceleration loss looks; at an end of the clip one is t itself,
+    and the loss is 0."""
     reach = LARGEST_DISTANCE / (time_count - 1) * (1 + float(torch.rand((), generator=generator))) / 2
     return max(t - reach, 0.0), min(t + reach, 1.0)
 

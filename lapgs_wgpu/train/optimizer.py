@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion
@@ -28,10 +26,7 @@ class Optimizer:
     """
 
     def __init__(
-        self,
-        gaussians: dict[str, nn.Parameter],
-        field: Mapping[str, list[nn.Parameter]],
-        rates: Mapping[str, Rate],
+        self, gaussians: dict[str, nn.Parameter], field: Mapping[str, list[nn.Parameter]], rates: Mapping[str, Rate]
     ) -> None:
         groups = {name: [parameter] for name, parameter in gaussians.items()} | dict(field)
         self.gaussians = gaussians
@@ -171,13 +166,3 @@ class FrequencyOptimizer:
     def state(self) -> dict[str, Tensor]:
         """Everything that the next step depends on, besides the frequencies and their gradient."""
         return {"mean": self._mean, "square": self._square, "steps": self._steps}
-
-    def packed(self) -> tuple[NDArray[np.float32], int]:
-        """The first moments of all frequencies and the second one, (K + 1,), and how many steps have moved them."""
-        return np.append(self._mean.numpy(), np.float32(self._square)), int(self._steps)
-
-    def unpack(self, moments: NDArray[np.float32], steps: int) -> None:
-        """Go on from what `packed` gave."""
-        self._mean.copy_(torch.from_numpy(moments[:-1]))
-        self._square.fill_(float(moments[-1]))
-        self._steps.fill_(steps)

@@ -15,8 +15,6 @@ from torch import Tensor, nn
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.array import DeviceArray, read_all
-from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.train.config import Rate
 from lapgs_wgpu.train.densify import DensityRule, published_rule
 from lapgs_wgpu.train.ground_truth import host_image
@@ -26,11 +24,22 @@ from lapgs_wgpu.train.step_result import StepResult
 # Called after each step, with the Trainer, whose state is that of the whole step. An error that it raises ends the call
 # of `Trainer.step`; the step stays done.
 Callback = Callable[[Any, StepResult], object]
-Weight = float | Callable[[int], float]
 
 
 @dataclass(frozen=True)
-class Regularizer:
+class LossTerm:
+    """A term of the loss, in torch: a `Regularizer` or a `TorchLoss`."""
+
+    name: str
+    function: Callable[..., Tensor]
+    weight: float | Callable[[int], float] = 1.0
+
+    def weight_at(self, step: int) -> float:
+        """The weight in a step, counted from 1."""
+        return float(self.weight(step) if callable(self.weight) else self.weight)
+
+
+class Regularizer(LossTerm):
     """A term of the Gaussians, in torch.
 
     Attributes:
@@ -40,13 +49,8 @@ class Regularizer:
         weight: of the term, or a function of the step, counted from 1; at 0 it is not computed.
     """
 
-    name: str
-    function: Callable[[Scene4D, Gaussians[Tensor], float], Tensor]
-    weight: Weight = 1.0
 
-
-@dataclass(frozen=True)
-class TorchLoss:
+class TorchLoss(LossTerm):
     """A term of the image, in torch. The image and its gradient then go through the host's memory in each step. Pixels
     that the losses leave out (data.masks) have the image's own color as ground truth, and no gradient.
 
@@ -56,12 +60,7 @@ class TorchLoss:
         weight: as in `Regularizer`.
     """
 
-    name: str
-    function: Callable[[Tensor, Tensor], Tensor]
-    weight: Weight = 1.0
 
-
-LossTerm = Regularizer | TorchLoss
 # Names of the terms of the configuration, and of what stands beside them in the log.
 TAKEN_NAMES = frozenset(
     {"l1", "mse", "ssim", "pyramid", "ncc", "smoothness", "acceleration", "dynamics", "loss", "psnr"}
@@ -129,12 +128,7 @@ class Parts:
         return rates
 
 
-def weight_at(term: LossTerm, step: int) -> float:
-    """The weight of a term in a step, counted from 1."""
-    return float(term.weight(step) if callable(term.weight) else term.weight)
-
-
-def torch_loss(term: TorchLoss, image: DeviceArray, truth: DeviceArray, weight: float) -> tuple[float, np.ndarray]:
+def torch_loss(term: LossTerm, image: DeviceArray, truth: DeviceArray, weight: float) -> tuple[float, np.ndarray]:
     """The value of a term, and its weighted gradient (4, H, W) by the image.
 
     image: (4, H, W) red, green, blue, transmittance. truth: (H, W) uint32 RGBA of the ground truth. Raises

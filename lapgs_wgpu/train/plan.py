@@ -15,8 +15,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.progress import duration
 from lapgs_wgpu.train.config import Config, changed
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.setup import open_dataset
-from lapgs_wgpu.train.start import start_from_points
+from lapgs_wgpu.train.setup import open_dataset, start_from_points
 from lapgs_wgpu.train.trainer import Trainer
 
 FILM, MASKS = "a film with masks of what moves", "masks"  # the latter is lapgs-prepare's folder of them
@@ -86,17 +85,16 @@ def plan_training(
     the time is short.
 
     opened: the capture of the folder, with images of any size. minutes: that the training may take, about; None for the
-    whole schedule. exposure: whether to learn a color correction for each image. Raises InputError
-    where the capture is not usable, or the time is too short for anything.
+    whole schedule. exposure: whether to learn a color correction for each image. Raises InputError where the capture is
+    not usable, or the time is too short for anything.
     """
     if minutes is not None and not 0 < minutes < math.inf:
         raise InputError(f"--minutes must be above 0, got {minutes:g}.")
     layout = camera_layout(opened)
     if layout == "one moving camera" and (folder / MASKS).is_dir():
         layout = FILM
-    small = PRESETS[layout][1]
-    for preset in (small,) if device.is_cpu else PRESETS[layout]:
-        last = preset == small
+    for preset in PRESETS[layout][1:] if device.is_cpu else PRESETS[layout]:
+        last = preset == PRESETS[layout][1]
         own = {"exposure.enabled": True} if exposure else {}
         config = load_config(preset, {"data.path": str(folder.resolve())} | own)
         # No densification beyond twice the initial number, so that the measured step tells of the whole training.

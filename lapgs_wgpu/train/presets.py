@@ -19,7 +19,7 @@ from lapgs_wgpu.errors import InputError, shown
 from lapgs_wgpu.io.dataclass_table import build_dataclass, checked, did_you_mean, field_types
 from lapgs_wgpu.io.safe_json_toml import read_toml
 from lapgs_wgpu.motion.fields.config import Method
-from lapgs_wgpu.train.config import Config, Rate
+from lapgs_wgpu.train.config import Config
 
 Table = dict[str, Any]
 ADVICE = '; add it, or start the file with base = "dnerf"'
@@ -79,18 +79,6 @@ def load_config(
     return build_dataclass(Config, base, preset, advice=ADVICE)
 
 
-def rates_that_stay(config: Config, given: Mapping[str, Any]) -> str:
-    """A note where schedule.steps is among the values that were given, and learning rates do not follow it; else ""."""
-    fixed = [
-        f"rates.{name}.steps {rate.steps}"
-        for name, rate in vars(config.rates).items()
-        if isinstance(rate, Rate) and rate.steps != config.schedule.steps and f"rates.{name}.steps" not in given
-    ]
-    if "schedule.steps" not in given or not fixed:
-        return ""
-    return f"schedule.steps is {config.schedule.steps}, and other keys that count steps stay: {', '.join(fixed)}."
-
-
 def _shorthands(method: str | None, ablate: Iterable[str]) -> dict[str, Any]:
     """Key of the configuration -> value of what `method` and `ablate` of `load_config` stand for."""
     values: dict[str, Any] = {}
@@ -125,7 +113,13 @@ def _read(preset: str, seen: tuple[str, ...] = ()) -> Table:
     """The table of a preset, laid over its base's."""
     if preset in seen:
         raise InputError(f"{preset}: its base leads back to itself ({' -> '.join((*seen, preset))}).")
-    table = _read_file(preset) if preset.endswith(".toml") else _read_packaged(preset)
+    if preset.endswith(".toml"):
+        table = _read_file(preset)
+    elif preset in _packaged():
+        table = dict(_packaged()[preset])
+    else:
+        hint = did_you_mean(preset, preset_names(), f"; there are {', '.join(preset_names())}, or give a .toml file.")
+        raise InputError(f"there is no preset {preset!r}{hint}")
     base = table.pop("base", None)
     if base is None:
         return table
@@ -143,15 +137,6 @@ def _read_file(path: str) -> Table:
     if of_a_run and (gone := _remove_unknown(table, Config)):
         print(f"note: {path}: ignores {', '.join(gone)}, which this version does not know.", file=sys.stderr)
     return table
-
-
-def _read_packaged(name: str) -> Table:
-    presets = _packaged()
-    if name not in presets:
-        names = preset_names()
-        hint = did_you_mean(name, names, f"; there are {', '.join(names)}, or give a .toml file.")
-        raise InputError(f"there is no preset {name!r}{hint}")
-    return dict(presets[name])
 
 
 @functools.cache
@@ -185,17 +170,10 @@ def _merge(below: Table, above: Table) -> Table:
 
 def _toml_lines(table: Mapping[str, Any], prefix: str) -> Iterator[str]:
     inner = {key: value for key, value in table.items() if isinstance(value, Mapping)}
-    yield from (f"{key} = {_toml_value(value)}" for key, value in table.items() if key not in inner)
+    for key, value in table.items():
+        if key not in inner:  # what JSON writes is TOML, but for one character
+            text = json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+            yield f"{key} = {text}"
     for key, value in inner.items():
         yield from ("", f"[{prefix}{key}]")
         yield from _toml_lines(value, f"{prefix}{key}.")
-
-
-def _toml_value(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, int | float):
-        return repr(value)
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    return f"[{', '.join(_toml_value(entry) for entry in value)}]"

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from lapgs_wgpu.data.views import View
 from lapgs_wgpu.gpu.array import DeviceArray
-from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.matmul import sum_columns
 from lapgs_wgpu.gpu.pool import BufferPool
@@ -43,28 +41,30 @@ class ResidentCorrections:
     on_host: whether the host may have changed them since they were pushed.
     """
 
-    def __init__(self, device: Device, learners: Learners) -> None:
-        self._device, self._pool, self._exposing = device, BufferPool(device), exposure_of(device)
+    def __init__(self, learners: Learners) -> None:
+        device = self._device = learners.scene.device
+        self._pool, self._exposing = BufferPool(device), exposure_of(device)
         self._cameras, self._exposures, self._numbers = learners.cameras, learners.exposures, learners.image_numbers
-        self._blocks: dict[str, tuple[Block, CameraRefinement | Exposures]] = {}
+        self._blocks: list[tuple[Block, CameraRefinement | Exposures]] = []
         if self._cameras is not None:
-            self._add("cameras", (len(self._cameras.numbers) + 1, _CAMERA_FLOATS), self._cameras)
+            self._camera_rows = self._add(self._cameras, (len(self._cameras.numbers) + 1, _CAMERA_FLOATS))
             common = torch.zeros(6 * len(self._cameras.numbers), _MOST_COMMON)
             common[:, : self._cameras.common.shape[1]] = self._cameras.common
             self._common = self._pool.upload("common motions", common.numpy())
         if self._exposures is not None:
-            self._add("exposure", (len(self._exposures.values), _EXPOSURE_FLOATS), self._exposures)
+            self._exposure_rows = self._add(self._exposures, (len(self._exposures.values), _EXPOSURE_FLOATS))
         self._d_camera, self._d_exposure = self._pool.array("d_camera", (8,)), self._pool.array("d_exposure", (12,))
         self.on_host = True
 
-    def _add(self, name: str, shape: tuple[int, int], of: CameraRefinement | Exposures) -> None:
-        block = Block(name, shape, None, _PLACES[name], arrays={"value": self._pool.array(name, shape)})
-        self._blocks[name] = block, of
+    def _add(self, of: CameraRefinement | Exposures, shape: tuple[int, int]) -> DeviceArray:
+        rows = self._pool.array(of.name, shape)
+        self._blocks.append((Block(of.name, shape, None, _PLACES[of.name], arrays={"value": rows}), of))
+        return rows
 
     def push(self) -> None:
         """Upload what the host has had since the last step."""
         if self.on_host:
-            for block, of in self._blocks.values():
+            for block, of in self._blocks:
                 block.arrays["value"].write(block.gather(of.state()))
         self.on_host = False
 
@@ -72,7 +72,7 @@ class ResidentCorrections:
     def pull(self) -> None:
         """Make the host's corrections the newest ones."""
         if not self.on_host:
-            for block, of in self._blocks.values():
+            for block, of in self._blocks:
                 block.scatter(block.arrays["value"].read(), of.state())
         self.on_host = True
 
@@ -99,7 +99,7 @@ class ResidentCorrections:
             return kernel.uniform("Moved", row=cameras.numbers[self._view.camera], unit=cameras.extent)
 
         moved = self._pool.array(f"frame {band}", frame.shape, frame.dtype)
-        given = {"moved": self._pool.varying("moved", write), "placed": frame, "cameras": self._value("cameras")}
+        given = {"moved": self._pool.varying("moved", write), "placed": frame, "cameras": self._camera_rows}
         commands.dispatch(kernel, 1, **given, frame=moved)
         return moved
 
@@ -107,14 +107,13 @@ class ResidentCorrections:
         """Record the image with its colors corrected."""
         if self._exposures is None:
             return image
-        return self._exposing.record(commands, image, self._value("exposure"), self._first_row)
+        return self._exposing.record(commands, image, self._exposure_rows, self._first_row)
 
     def expose_bwd(self, commands: Commands, image: DeviceArray, d_exposed: DeviceArray) -> DeviceArray:
         """Record the gradient by the image, and that by the correction of its colors."""
         if self._exposures is None:
             return d_exposed
-        values = self._value("exposure")
-        d_image, d_rows = self._exposing.record_bwd(commands, image, d_exposed, values, self._first_row)
+        d_image, d_rows = self._exposing.record_bwd(commands, image, d_exposed, self._exposure_rows, self._first_row)
         sum_columns(commands, self._pool, d_rows, self._d_exposure, columns=12)
         return d_image
 
@@ -128,8 +127,9 @@ class ResidentCorrections:
 
     def record_check(self, commands: Commands, bad: DeviceArray) -> None:
         """Record the search for gradients that are not finite."""
-        for gradient in self._gradients().values():
-            check_finite(commands, self._pool, gradient, bad)
+        for gradient, used in ((self._d_camera, self.moves_camera), (self._d_exposure, self._exposures is not None)):
+            if used:
+                check_finite(commands, self._pool, gradient, bad)
 
     def record_step(self, commands: Commands, guard: DeviceArray, frame: DeviceArray, geometry: DeviceArray) -> None:
         """Record a step of the corrections, after the one of the Gaussians. frame: that `move` gave; geometry: (N, 12)
@@ -144,7 +144,7 @@ class ResidentCorrections:
             count, rate = len(exposures.values), exposures.rate.at(self._step)
             return kernel.uniform("ExposureStep", number=self._numbers[self._view.name], count=count, rate=rate)
 
-        arrays = {"guard": guard, "d_exposure": self._d_exposure, "exposures": self._value("exposure")}
+        arrays = {"guard": guard, "d_exposure": self._d_exposure, "exposures": self._exposure_rows}
         commands.dispatch(kernel, 1, descent=self._pool.varying("exposure step", write), **arrays)
 
     def _step_camera(self, commands: Commands, guard: DeviceArray, frame: DeviceArray, geometry: DeviceArray) -> None:
@@ -163,18 +163,7 @@ class ResidentCorrections:
 
         arrays = {"guard": guard, "motion": motion, "d_camera": self._d_camera, "common_motions": self._common}
         descent = self._pool.varying("camera step", write)
-        commands.dispatch(kernel, 1, descent=descent, cameras=self._value("cameras"), **arrays)
-
-    def gradients(self) -> dict[str, list[Tensor]]:
-        """Of the view's corrections, read back; for the text of an error."""
-        return {name: [torch.from_numpy(gradient.read())] for name, gradient in self._gradients().items()}
-
-    def _gradients(self) -> dict[str, DeviceArray]:
-        found = {"cameras": self._d_camera} if self.moves_camera else {}
-        return found | ({"exposure": self._d_exposure} if self._exposures is not None else {})
-
-    def _value(self, name: str) -> DeviceArray:
-        return self._blocks[name][0].arrays["value"]
+        commands.dispatch(kernel, 1, descent=descent, cameras=self._camera_rows, **arrays)
 
     def _first_row(self) -> int:
         return self._numbers[self._view.name] * _EXPOSURE_FLOATS // 4

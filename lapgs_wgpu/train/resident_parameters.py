@@ -6,27 +6,25 @@ next step pushes what the host may have changed.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.array import DeviceArray, read_all
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.laplacian import VARIANCE_FLOOR, VARIANCE_SPREAD
 from lapgs_wgpu.motion.passes.activation_passes import GEOMETRY_FLOATS, SH_FLOATS
-from lapgs_wgpu.motion.passes.decoder_passes import ALIGNED, FieldWeights
+from lapgs_wgpu.motion.passes.decoder_passes import FieldWeights
 from lapgs_wgpu.motion.passes.grid_field_passes import FieldArrays
-from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.optimizer import LARGEST_FREQUENCY_STEP
 
-_MOST_RATES = 512  # columns with a rate of their own
 KINDS = ("value", "gradient", "mean", "square")
 PARTS = ("gaussians", "field")  # of a scene, which go between host and device by themselves
 FREQUENCIES = "motion.frequencies"
@@ -39,8 +37,7 @@ class Block:
 
     group: of the optimizer that all values belong to; None where each tensor is a group of its own. parts: by name of a
     tensor its place. ones: whether the last column holds ones, which no step changes. moved: number of values that Adam
-    moves; the others have an optimizer of their own. moving: whether only steps with motion move them. first: number
-    of the part's array. arrays: by kind.
+    moves; the others have an optimizer of their own. moving: whether only steps with motion move them. arrays: by kind.
     """
 
     name: str
@@ -50,7 +47,6 @@ class Block:
     ones: bool = False
     moved: int | None = None
     moving: bool = True
-    first: int = 0
     arrays: dict[str, DeviceArray] = field(default_factory=dict)
 
     @property
@@ -80,13 +76,13 @@ class ResidentParameters:
     steps: by name of a tensor, how many steps have moved it.
     """
 
-    def __init__(self, scene: Scene4D, weights: FieldWeights | None, learners: Learners) -> None:
+    def __init__(self, learners: Learners, weights: FieldWeights | None) -> None:
+        scene = learners.scene
         self._device, self._pool, self._weights = scene.device, BufferPool(scene.device), weights
         self._optimizer, self._frequencies = learners.optimizer, learners.frequencies
         tensors = dict(scene.field.named_parameters()) if scene.field is not None else {}
         self._tensors: dict[str, Mapping[str, Tensor]] = {"gaussians": scene.parameters, "field": tensors}  # by part
         self._blocks_of: dict[str, list[Block]] = {}  # by part
-        self._arrays: dict[tuple[str, str], DeviceArray] = {}  # of all blocks together, by part and kind
         self.steps: dict[str, int] = {}
         # The parts that the host may have changed since they were pushed: their values, the optimizers' state of them.
         self.values_on_host, self.state_on_host = set(PARTS), set(PARTS)
@@ -95,31 +91,23 @@ class ResidentParameters:
 
     def _lay_out(self, part: str) -> None:
         """Make arrays for the tensors of a part as they are."""
-        blocks, size = self._gaussians_layout() if part == "gaussians" else self._field_layout(), 0
-        for block in blocks:
-            block.first, size = size, size + -(-math.prod(block.shape) // ALIGNED) * ALIGNED
-        for kind in KINDS:
-            array = self._arrays[part, kind] = self._pool.array(f"{part} {kind}", (size,))
-            for block in blocks:
-                block.arrays[kind] = DeviceArray(array.buffer, block.shape, offset=4 * block.first)
-        self._blocks_of[part] = blocks
+        self._blocks_of[part] = self._gaussians_layout() if part == "gaussians" else self._field_layout()
+        for block in self._blocks_of[part]:
+            block.arrays = {kind: self._pool.array(f"{block.name} {kind}", block.shape) for kind in KINDS}
 
     def _write(self, part: str, kind: str, tensors: Mapping[str, Tensor | None]) -> None:
         """Upload all of a kind; tensors that are None are zeros."""
-        content = np.zeros(self._arrays[part, kind].shape, np.float32)
         for block in self._blocks_of[part]:
             values = block.gather(tensors)
             if block.ones and kind == "value":
                 values[:, -1] = 1.0
-            content[block.first : block.first + values.size] = values.reshape(-1)
-        self._arrays[part, kind].write(content)
+            block.arrays[kind].write(values)
 
     def _read(self, part: str, kind: str, into: Mapping[str, Tensor]) -> None:
         """Copy all of a kind into tensors."""
-        content = self._arrays[part, kind].read()
-        for block in self._blocks_of[part]:
-            values = content[block.first : block.first + math.prod(block.shape)]
-            block.scatter(values.reshape(block.shape), into)
+        blocks = self._blocks_of[part]
+        for block, content in zip(blocks, read_all([block.arrays[kind] for block in blocks]), strict=True):
+            block.scatter(content, into)
 
     def _gaussians_layout(self) -> list[Block]:
         gaussians, every = self._tensors["gaussians"], slice(None)
@@ -166,21 +154,19 @@ class ResidentParameters:
             for kind, key in (("mean", "exp_avg"), ("square", "exp_avg_sq")):
                 self._write(part, kind, {name: each.get(key) for name, each in state.items()})
             if part == "field" and self._frequencies is not None:
-                content, self.steps[FREQUENCIES] = self._frequencies.packed()
-                self._frequency_state = self._pool.upload("frequencies", content)
+                own = self._frequencies.state()
+                self.steps[FREQUENCIES] = int(own["steps"])
+                moments = np.append(own["mean"].numpy(), np.float32(own["square"]))
+                self._frequency_state = self._pool.upload("frequencies", moments)
         self.values_on_host, self.state_on_host = set(), set()
 
     @torch.no_grad()
-    def pull_values(self, *parts: str) -> None:
-        """Make torch's tensors of some parts, of all if none is named, the newest ones."""
+    def pull(self, *parts: str, state: bool) -> None:
+        """Make torch's tensors of some parts, of all if none is named, the newest ones. state: and the optimizers'."""
         for part in set(parts or PARTS) - self.values_on_host:
             self.values_on_host.add(part)
             self._read(part, "value", self._tensors[part])
-
-    @torch.no_grad()
-    def pull_state(self, *parts: str) -> None:
-        """Make torch's state of the optimizers of some parts, of all if none is named, the newest one."""
-        for part in set(parts or PARTS) - self.state_on_host:
+        for part in set(parts or PARTS) - self.state_on_host if state else ():
             self.state_on_host.add(part)
             tensors = self._tensors[part]
             means, squares = ({name: torch.zeros_like(tensor) for name, tensor in tensors.items()} for _ in range(2))
@@ -190,7 +176,10 @@ class ResidentParameters:
                 if self.steps[name] and name != FREQUENCIES:
                     self._optimizer.set_state(tensor, self.steps[name], means[name], squares[name])
             if part == "field" and self._frequencies is not None:
-                self._frequencies.unpack(self._frequency_state.read(), self.steps[FREQUENCIES])
+                moments, own = self._frequency_state.read(), self._frequencies.state()
+                own["mean"].copy_(torch.from_numpy(moments[:-1]))
+                own["square"].fill_(float(moments[-1]))
+                own["steps"].fill_(self.steps[FREQUENCIES])
 
     @property
     def blocks(self) -> dict[str, Block]:
@@ -215,15 +204,10 @@ class ResidentParameters:
     def _moved(self, *, moving: bool) -> Iterator[Block]:
         return (block for block in self.blocks.values() if moving or not block.moving)
 
-    def clear_gradients(self, commands: Commands) -> None:
-        """Record zeros for the gradients, which each step of Adam leaves."""
-        for part in PARTS:
-            commands.clear(self._arrays[part, "gradient"])
-
     def record_check(self, commands: Commands, bad: DeviceArray, *, moving: bool) -> None:
         """Record the search for gradients that are not finite."""
-        for part in PARTS if moving else PARTS[:1]:
-            check_finite(commands, self._pool, self._arrays[part, "gradient"], bad)
+        for block in self._moved(moving=moving):
+            check_finite(commands, self._pool, block.arrays["gradient"], bad)
 
     def count_step(self, *, moving: bool) -> None:
         """A step that moves the parameters is about to be recorded."""
@@ -231,29 +215,25 @@ class ResidentParameters:
             for name in block.parts:
                 self.steps[name] += 1
 
-    def _rates(self, rates: Mapping[str, float], *, moving: bool) -> bytes:
-        """The corrected rates of a step, a pair for each column that has its own. rates: of the optimizer's groups."""
-        table, first = np.zeros((_MOST_RATES, 2), np.float32), 0
-        for block in self._moved(moving=moving):
-            columns = block.rate_columns
-            for name, (_, place) in block.parts.items():
-                if name != FREQUENCIES:
-                    own = table[first : first + columns]
-                    own[place if columns > 1 else 0] = _corrected(rates[block.group or name], self.steps[name])
-            first += columns
-        return table[:first].tobytes()
+    def _rates(self, block: Block, rates_of: Callable[[], Mapping[str, float]]) -> bytes:
+        """The corrected rates of a step, a pair for each column that has its own."""
+        table, rates = np.zeros((block.rate_columns, 2), np.float32), rates_of()
+        for name, (_, place) in block.parts.items():
+            if name != FREQUENCIES:
+                columns = place if block.group is None else 0
+                table[columns] = _corrected(rates[block.group or name], self.steps[name])
+        return table.tobytes()
 
     def record_adam(
         self, commands: Commands, guard: DeviceArray, rates_of: Callable[[], Mapping[str, float]], *, moving: bool
     ) -> None:
         """Record a step of the optimizers, by the rates of its groups and of FREQUENCIES."""
-        kernel, first = Kernel.get(self._device, "adam"), 0
-        written = self._pool.varying(f"rates {moving}", lambda: self._rates(rates_of(), moving=moving))
-        rates = DeviceArray(written.buffer, (written.nbytes // 8, 2), offset=written.offset)
+        kernel = Kernel.get(self._device, "adam")
         for block in self._moved(moving=moving):
+            written = self._pool.varying(f"rates {block.name}", partial(self._rates, block, rates_of))
+            rates = DeviceArray(written.buffer, (block.rate_columns, 2), offset=written.offset)
             count = block.arrays["value"].size if block.moved is None else block.moved
-            content = kernel.uniform("Adam", count=count, columns=block.rate_columns, first=first)
-            first += block.rate_columns
+            content = kernel.uniform("Adam", count=count, columns=block.rate_columns, first=0)
             arrays = {name: block.arrays[name[:-1]] for name in ("gradients", "values", "means", "squares")}
             adam = self._pool.constant(content)
             commands.dispatch(kernel, -(-count // 256), adam=adam, guard=guard, rates=rates, **arrays)
@@ -278,13 +258,6 @@ class ResidentParameters:
         spectrum = self._pool.varying("frequencies uniform", write)
         weights = {"weights": self.flat_weights("value"), "d_weights": self.flat_weights("gradient")}
         commands.dispatch(kernel, 1, spectrum=spectrum, guard=guard, state=self._frequency_state, **weights)
-
-    def gradients(self) -> dict[str, list[Tensor]]:
-        """Of each tensor, read back; for the text of an error."""
-        gradients = {name: torch.zeros_like(t) for part in PARTS for name, t in self._tensors[part].items()}
-        for part in PARTS:
-            self._read(part, "gradient", gradients)
-        return {name: [gradient] for name, gradient in gradients.items()}
 
 
 def check_finite(commands: Commands, pool: BufferPool, values: DeviceArray, bad: DeviceArray) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 from lapgs_wgpu.data.views import View
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
+from lapgs_wgpu.gpu.later import Later
 from lapgs_wgpu.gpu.matmul import sum_columns
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.gpu.recording import Recording
@@ -17,17 +18,16 @@ from lapgs_wgpu.motion.passes.activation_passes import ActivationPasses, Line
 from lapgs_wgpu.motion.passes.decoder_passes import Decoding
 from lapgs_wgpu.motion.passes.grid_field_passes import GridFieldPasses
 from lapgs_wgpu.motion.passes.samples import Samples
-from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.drawing import Drawing, GaussianGradients
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterizer_of
-from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config, LossWeights
+from lapgs_wgpu.train.config import BACKGROUND_LEVELS, LossWeights
 from lapgs_wgpu.train.fused_loss import image_loss_of
+from lapgs_wgpu.train.ground_truth import Mark
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.resident_corrections import ResidentCorrections
 from lapgs_wgpu.train.resident_parameters import ResidentParameters, check_finite
-from lapgs_wgpu.train.step_result import Scheduled
-from lapgs_wgpu.train.view_order import Mark
+from lapgs_wgpu.train.step_result import Measured, Scheduled
 
 TOTALS = ("static", "temporal", "acceleration", "dynamics")  # sums of losses of motion, in their places
 _DYNAMICS_GROUPS, _MOST_COLUMNS = 64, 256  # common/dynamics.wgsl
@@ -35,17 +35,17 @@ _DYNAMICS_GROUPS, _MOST_COLUMNS = 64, 256  # common/dynamics.wgsl
 
 @dataclass
 class Task:
-    """A resident step to be taken.
+    """A resident step.
 
-    scheduled: what the schedule says. before, drawn: where the draws stood before its view and before its samples.
-    view: of the training. time: of the field. sh_degree: of the harmonics in use. rates: of the optimizer's groups, and
-    of FREQUENCIES. near, near_time: the places and the time that the smoothness loss compares; None in steps without
-    it. even, even_times: those of the acceleration loss. counts: how many steps had moved each tensor before.
+    scheduled: what the schedule says. before: where the draws stood before its view. view: of the training. time: of
+    the field. sh_degree: of the harmonics in use. rates: of the optimizer's groups, and of FREQUENCIES. near,
+    near_time: the places and the time that the smoothness loss compares; None in steps without it. even, even_times:
+    those of the acceleration loss. Once it was submitted: counts, how many steps had moved each tensor before; drawing;
+    later, what it tells; once it is settled: measured.
     """
 
     scheduled: Scheduled
     before: Mark
-    drawn: Mark
     view: View
     time: float
     sh_degree: int
@@ -54,7 +54,10 @@ class Task:
     near_time: float = 0.0
     even: Samples | None = None
     even_times: tuple[float, float] = (0.0, 0.0)
-    counts: dict[str, int] = field(default_factory=dict)
+    counts: dict[str, int] = field(init=False)
+    drawing: Drawing = field(init=False)
+    later: Later = field(init=False)
+    measured: Measured | None = None
 
 
 # The passes of a step: its drawing, and what is read of it later.
@@ -66,31 +69,41 @@ Decodings = tuple[Decoding | None, Line | None]
 class ResidentPasses:
     """Records the passes of the steps of a training.
 
-    parameters, corrections: what the steps move, the latter of cameras and colors. dynamics_loss: whether the loss has
-    a term of the dynamics attributes.
+    parameters, corrections: what the steps move, the latter of cameras and colors.
     """
 
-    def __init__(self, config: Config, scene: Scene4D, learners: Learners) -> None:
-        self._config, self._scene, self._device = config, scene, scene.device
+    def __init__(self, learners: Learners) -> None:
+        config, scene = self._config, self._scene = learners.config, learners.scene
+        self._device = scene.device
         self._field = GridFieldPasses(scene.device, scene.field_config) if isinstance(scene.field, GridField) else None
-        self.parameters = ResidentParameters(scene, self._field.weights if self._field else None, learners)
-        self.corrections = ResidentCorrections(scene.device, learners)
+        self.parameters = ResidentParameters(learners, self._field.weights if self._field else None)
+        self.corrections = ResidentCorrections(learners)
         self._activation = ActivationPasses(scene.device, scene.field_config)
         self.rasterizer, self._losses = rasterizer_of(scene.device), image_loss_of(scene.device)
         self._pool = BufferPool(scene.device)
         self._recordings: dict[tuple[Any, ...], tuple[Recording, Recorded]] = {}
         level = BACKGROUND_LEVELS[config.data.background]
         self._background, self._checked = (level, level, level), False
-        self.dynamics_loss = bool(config.loss.dynamics) and scene.field_config.dynamics_size > 0
+        self._dynamics_loss = bool(config.loss.dynamics) and scene.field_config.dynamics_size > 0
         self._task: Task
 
-    @property
-    def moves(self) -> bool:
-        """Whether there is a field."""
-        return self._field is not None
+    def terms(self, task: Task, values: list[float], totals: list[float]) -> dict[str, float]:
+        """What each term adds to the loss of a step, by the losses of the image and of motion that `record` lists."""
+        weights, (l1, _, *others) = self._weights(task), values
+        found = {"l1": weights.l1 * l1}
+        for name, value in zip(("ssim", "pyramid", "ncc"), others, strict=True):
+            if weight := getattr(weights, name):
+                found[name] = weight * value
+        static, temporal, even, dynamics = totals
+        if task.near is not None:
+            found["smoothness"] = static + temporal
+        if task.even is not None:
+            found["acceleration"] = even
+        if task.scheduled.moving and self._dynamics_loss:
+            found["dynamics"] = dynamics
+        return found
 
-    def weights(self, task: Task) -> LossWeights:
-        """Of the image losses of a step."""
+    def _weights(self, task: Task) -> LossWeights:
         return self._config.loss.weights(warm=task.scheduled.moving)
 
     def seen(self) -> DeviceArray:
@@ -101,8 +114,8 @@ class ResidentPasses:
         """A word that passes share: guard or bad."""
         return self._pool.array(name, (1,), "uint32")
 
-    def record(self, commands: Commands, task: Task, truth: DeviceArray, *, judged: bool) -> Recorded:
-        """Record a step. truth: (H, W), of its view. judged: only up to the gradients, which stay."""
+    def record(self, commands: Commands, task: Task, truth: DeviceArray) -> Recorded:
+        """Record a step. truth: (H, W), of its view."""
         self._task = task
         self.corrections.begin(task.view, task.scheduled.step)
         self.parameters.count_step(moving=task.scheduled.moving)
@@ -110,8 +123,8 @@ class ResidentPasses:
         commands.copy(truth, held)
         camera = task.view.camera
         shape = (
-            *(task.scheduled.moving, task.scheduled.seen, task.near is None, task.even is None, judged),
-            *(task.sh_degree, camera.width, camera.height, self.rasterizer.plan_of(camera), len(self._scene)),
+            *(task.scheduled.moving, task.scheduled.seen, task.near is None, task.even is None, task.sh_degree),
+            *(camera.width, camera.height, self.rasterizer.plan_of(camera), len(self._scene)),
             self.corrections.moves_camera,
         )
         self._recordings = {key: each for key, each in self._recordings.items() if each[0].holds}
@@ -121,10 +134,10 @@ class ResidentPasses:
             commands.replay(recording)
             return step
         if self._device.textures:  # copies to them depend on what was done before
-            return self._record(commands, task, held, judged=judged)
+            return self._record(commands, task, held)
         recording = Recording(self._device)
         with commands.taken_down(recording):
-            step = self._record(commands, task, held, judged=judged)
+            step = self._record(commands, task, held)
         self._recordings[shape] = recording, step
         return step
 
@@ -146,14 +159,14 @@ class ResidentPasses:
         d_image = self._losses.pool.array("d_image", (4, camera.height, camera.width))
         self.rasterizer.backward(self.rasterizer.draw_whole(drawn, camera, gradient=True), d_image)
 
-    def _record(self, commands: Commands, task: Task, truth: DeviceArray, *, judged: bool) -> Recorded:
+    def _record(self, commands: Commands, task: Task, truth: DeviceArray) -> Recorded:
         guard, bad = self.word("guard"), self.word("bad")
         totals = self._pool.array("totals", (len(TOTALS),))
         for array in (bad, totals):
             commands.clear(array)
         decodings = self._decode(commands, task)
         drawn = self._activate(commands, task.sh_degree, decodings[0])
-        corrections, weights = self.corrections, self.weights(task)
+        corrections, weights = self.corrections, self._weights(task)
         drawing = self.rasterizer.record(commands, drawn, task.view.camera, self._background, corrections.move)
         image = corrections.expose(commands, drawing.image)
         terms, d_image = self._losses.record(commands, image, truth, weights)
@@ -161,7 +174,7 @@ class ResidentPasses:
         by_drawn = self.rasterizer.record_bwd(commands, drawing, d_image, camera=corrections.moves_camera)
         corrections.sum_camera(commands, by_drawn.camera)
         self._record_bwd(commands, drawn, by_drawn, decodings, totals)
-        self._record_end(commands, task, drawing, by_drawn, terms, judged=judged)
+        self._record_end(commands, task, drawing, by_drawn, terms)
         return drawing, [guard, bad, terms, totals, *drawing.needed]
 
     def _decode(self, commands: Commands, task: Task) -> Decodings:
@@ -211,7 +224,7 @@ class ResidentPasses:
             differences = field.compare(commands, values, gradients, near, times, weights)
             for total, sums, weight in zip(TOTALS, differences, weights, strict=False):
                 self._total(commands, sums, total, weight, totals)
-        if self.dynamics_loss:
+        if self._dynamics_loss:
             self._dynamics(commands, values.beside, gradients.beside, totals)
 
     def _total(self, commands: Commands, values: DeviceArray, name: str, factor: float, totals: DeviceArray) -> None:
@@ -233,14 +246,7 @@ class ResidentPasses:
         self._total(commands, arrays["losses"], "dynamics", 1.0, totals)
 
     def _record_end(
-        self,
-        commands: Commands,
-        task: Task,
-        drawing: Drawing,
-        by_drawn: GaussianGradients,
-        terms: DeviceArray,
-        *,
-        judged: bool,
+        self, commands: Commands, task: Task, drawing: Drawing, by_drawn: GaussianGradients, terms: DeviceArray
     ) -> None:
         """Record whether the step may change anything, and what it changes."""
         moving, count, guard, bad = task.scheduled.moving, len(self._scene), self.word("guard"), self.word("bad")
@@ -254,8 +260,6 @@ class ResidentPasses:
         )
         for needed in drawing.needed:
             commands.dispatch(close, 1, guarded=guarded, needed=needed, bad=bad, guard=guard)
-        if judged:
-            return
         if task.scheduled.seen:
             kernel, camera = Kernel.get(self._device, "accumulate_statistics"), task.view.camera
             content = kernel.uniform("Seen", half_size=(camera.width / 2, camera.height / 2), gaussians=count)

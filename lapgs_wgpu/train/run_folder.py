@@ -28,10 +28,8 @@ from lapgs_wgpu.train.presets import write_toml
 
 LOST = 0.8  # share of the moving pixels; where fewer are drawn as they are, that is a warning
 STATE = "state.safetensors"
-RUN_FILES = (
-    "config.toml", "log.jsonl", "metrics.json", "metrics.csv", "checkpoint.ply", "eval", "tensorboard",
-    STATE,
-)  # fmt: skip
+# Of a run, and of older versions. config.toml, by which --overwrite knows a run, is replaced at once instead.
+RUN_FILES = ("log.jsonl", "metrics.json", "metrics.csv", "checkpoint.ply", "eval", "tensorboard", STATE)
 
 State = Mapping[str, NDArray[Any]]
 
@@ -52,15 +50,11 @@ def check_run_folder(out: Path, *, overwrite: bool) -> None:
 def start_run_folder(out: Path, config: Config, device: Device, dataset: Dataset) -> None:
     """Free the folder of an earlier run's files, and write config.toml."""
     for name in RUN_FILES:
-        if name == "config.toml" and (out / name).is_file():
-            continue  # is replaced at once, so that a process that is killed leaves what --overwrite knows for a run
         if (out / name).is_dir() and not (out / name).is_symlink():
             shutil.rmtree(out / name)
         else:
             (out / name).unlink(missing_ok=True)
-    table = {**dataclasses.asdict(config), "record": _record(config, device, dataset)}
-    with atomic_write(out / "config.toml") as file:
-        file.write(write_toml(table).encode())
+    _write_config(out, config, _record(config, device, dataset))
 
 
 def changes_since(out: Path, config: Config, device: Device, dataset: Dataset) -> list[tuple[str, str, str]]:
@@ -86,8 +80,19 @@ def note_paths(out: Path, config: Config) -> None:
     except (InputError, KeyError, TypeError):
         return
     if known != config.data.path:
-        with atomic_write(out / "config.toml") as file:
-            file.write(write_toml({**dataclasses.asdict(config), "record": _recorded(out)}).encode())
+        _write_config(out, config, _recorded(out))
+
+
+def _write_config(out: Path, config: Config, record: dict[str, str]) -> None:
+    with atomic_write(out / "config.toml") as file:
+        file.write(write_toml({**dataclasses.asdict(config), "record": record}).encode())
+
+
+def _record(config: Config, device: Device, dataset: Dataset) -> dict[str, str]:
+    """What the bits of a run depend on besides its configuration."""
+    record = {**environment(device), "data": dataset.fingerprint}
+    threads = step_threads(config.field, device)
+    return record if threads is None else {**record, "torch_threads": str(threads)}
 
 
 def _recorded(out: Path) -> dict[str, str]:
@@ -116,13 +121,6 @@ def result_text(run: Path) -> str:
         f"{run}: {metrics['psnr']:.2f} dB PSNR, {metrics['ssim']:.4f} SSIM on {len(metrics['views'])} test views of "
         f"{width}x{height}, {metrics['gaussians']} Gaussians"
     )
-
-
-def _record(config: Config, device: Device, dataset: Dataset) -> dict[str, str]:
-    """What the bits of a run depend on besides its configuration."""
-    record = {**environment(device), "data": dataset.fingerprint}
-    threads = step_threads(config.field, device)
-    return record if threads is None else {**record, "torch_threads": str(threads)}
 
 
 def save_state(out: Path, state: State) -> None:

@@ -25,19 +25,17 @@ from lapgs_wgpu.train.densify import Statistics
 from lapgs_wgpu.train.density_control import DensityControl
 from lapgs_wgpu.train.evaluate import evaluate
 from lapgs_wgpu.train.exchange_step import ExchangeStep
-from lapgs_wgpu.train.ground_truth import GroundTruth
+from lapgs_wgpu.train.ground_truth import Draws, GroundTruth
 from lapgs_wgpu.train.host import step_threads, torch_threads
 from lapgs_wgpu.train.learners import Learners
-from lapgs_wgpu.train.nonfinite import MOST_SKIPPED, Skipped
 from lapgs_wgpu.train.parts import Parts
 from lapgs_wgpu.train.resident_step import ResidentStep
-from lapgs_wgpu.train.setup import set_up, why_exchange
-from lapgs_wgpu.train.start import Start, start_from_points
-from lapgs_wgpu.train.step_result import Scheduled, StepResult
+from lapgs_wgpu.train.setup import Start, set_up, start_from_points, why_exchange
+from lapgs_wgpu.train.step_result import Measured, Scheduled, StepResult
 from lapgs_wgpu.train.timing_refinement import TimingRefinement
-from lapgs_wgpu.train.view_order import Draws
 
 MAX_SH_DEGREE = 3
+MOST_SKIPPED = 10  # steps in a row, which end a training
 
 
 class Trainer:
@@ -105,21 +103,18 @@ class Trainer:
         config, scene, dataset = self.config, self.scene, self.dataset
         color = torch.full((3,), BACKGROUND_LEVELS[config.data.background])
         self._truth = GroundTruth(scene.device, color, int(config.data.cache_gb * 1e9))
-        self._draws = Draws(dataset.train, self._generator)
+        self._draws = Draws(dataset.train, self._generator, self._truth)
         self._learners = Learners(config, dataset, self.parts, start)
-        self._density = DensityControl(config, scene, self._learners, self.parts.density, dataset, self._generator)
+        self._density = DensityControl(self._learners, self._generator)
         self.timing = None
         if config.timing.refine and scene.field is not None and len(dataset.times) > 2:
             self.timing = TimingRefinement(scene, dataset.train, self._truth.on_host, self._picture, dataset.time_gap)
-        self._timing_steps = config.timing.corrections(config.schedule.steps) if self.timing else []
         self._skipped = 0  # steps in a row
-        shared = self._learners, self._density, self._truth, self._draws
-        self._exchange = ExchangeStep(config, scene, self.parts.losses, dataset, *shared)
+        shared = self._learners, self._density, self._draws
+        self._exchange = ExchangeStep(*shared)
         self._resident = None
         if config.step_place == "resident":
-            self._resident = ResidentStep(config, scene, *shared, dataset.moments)
-            self._resident.broken = self._broken
-            self._resident.tell = lambda measured: self._note(measured.skipped)
+            self._resident = ResidentStep(*shared, self._broken, self._note)
         self._plans, camera = rasterizer_of(scene.device).plans, dataset.train[0].camera
         self._drawn = (camera.width, camera.height, True)  # the kind of images that the steps draw
         self._plans.set_bands(self._drawn, 1)
@@ -159,8 +154,12 @@ class Trainer:
     def evaluate(self, views: Sequence[View] | None = None) -> dict[str, Any]:
         """Measure the scene on views, the test views where None: the content of metrics.json (docs/metrics.md).
         Training views are seen by their corrected cameras."""
-        chosen = self.dataset.test if views is None else views
-        return evaluate(self.scene, self._as_seen(chosen), self.config.data.background)
+        trained, chosen = set(self.dataset.cameras), self.dataset.test if views is None else views
+        seen = [
+            dataclasses.replace(view, camera=self._learners.camera(view)) if view.camera in trained else view
+            for view in chosen
+        ]
+        return evaluate(self.scene, seen, self.config.data.background)
 
     def psnr(self, views: Sequence[View]) -> float:
         """The mean over views of the PSNR, dB, as `evaluate` measures it."""
@@ -201,9 +200,9 @@ class Trainer:
         # Before this step draws: both may wait for steps in flight, which may draw again.
         if self._resident is not None:
             self._resident.make_room()
-        field_times = None
-        if self.timing is not None and moving and step in self._timing_steps:
-            field_times = self.timing.fitted(self._timing_steps.index(step))
+        field_times, corrections = None, self.config.timing.corrections(self.config.schedule.steps)
+        if self.timing is not None and moving and step in corrections:
+            field_times = self.timing.fitted(corrections.index(step))
         before = self._draws.mark()
         try:
             scheduled = Scheduled(step, moving, share, step < self.config.density.stop)
@@ -220,7 +219,7 @@ class Trainer:
         self.done = step
         self.whole = True
         if self._resident is None:
-            self._note(measured().skipped)
+            self._note(measured())
         return StepResult(step, self.config.schedule.steps, measured)
 
     def _share_of_rates(self, step: int) -> float:
@@ -229,11 +228,12 @@ class Trainer:
         falling, left = self.config.schedule.cool_down * steps, steps - step + 1
         return min(1.0, step / rising if rising else 1.0, left / falling if falling else 1.0)
 
-    def _note(self, skipped: Skipped | None) -> None:
+    def _note(self, measured: Measured) -> None:
         """Take in whether a step was skipped. Raises NumericalError where too many in a row were."""
-        self._skipped = 0 if skipped is None else self._skipped + 1
+        self._skipped = 0 if measured.skipped is None else self._skipped + 1
         if self._skipped == MOST_SKIPPED:
-            raise NumericalError(f"{MOST_SKIPPED} steps in a row had values that are not finite; the last: {skipped}")
+            what = f"{MOST_SKIPPED} steps in a row had values that are not finite; the last: {measured.skipped}"
+            raise NumericalError(what)
 
     def _began(self) -> None:
         self.whole = False
@@ -243,14 +243,6 @@ class Trainer:
         left to go back to."""
         self.whole = settled is not None
         self.done = self.done if settled is None else settled
-
-    def _as_seen(self, views: Sequence[View]) -> list[View]:
-        """The views, those by cameras of the training with the corrections of these."""
-        trained = set(self.dataset.cameras)
-        return [
-            dataclasses.replace(view, camera=self._learners.camera(view)) if view.camera in trained else view
-            for view in views
-        ]
 
     @torch.no_grad()
     def _picture(self, view: View, timing: Timing) -> Tensor:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from helpers.playback import open_playback
 from helpers.ply_files import columns_of, ply_bytes, random_still
 from helpers.scene_files import scene_of_outliers
@@ -22,7 +21,6 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.motion.scene_file import compact_bytes, read_scene
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.run_folder import changes_since
 
 GRID = HashConfig(1, (2, 2, 2), (2, 2, 2), 4)
 PLANES = PlaneConfig(features=1, space=2, time=2, levels=1)
@@ -77,13 +75,6 @@ def short_config() -> Config:
     few |= {"schedule.warm_up": "0", "schedule.steps": "5"}
     grids = {f"field.{name}.{end}": ["4", "4", "4"] for name in ("static", "temporal") for end in ("base", "finest")}
     return load_config("tiny", {**few, **grids})
-
-
-def changes_since_without_device(folder: Path) -> Any:
-    """`changes_since` with fixed words for what this machine is."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lapgs_wgpu.train.run_folder._record", lambda *_: {"torch": "3"})
-        return changes_since(folder, None, None, None)  # type: ignore[arg-type]
 
 
 def with_checksums(data: bytes) -> bytes:

@@ -58,6 +58,8 @@ def pyramid_loss(image: Tensor, target: Tensor) -> Tensor:
     level = (image - target).permute(2, 0, 1)
     sizes = pyramid_sizes(*level.shape[1:])
     loss = level.new_zeros(())
+    if len(sizes) == 1:
+        return 0.0 * image.sum()
     for weight, coarse in zip(pyramid_weights(len(sizes)), [*sizes[1:], None], strict=True):
         if coarse is None:
             return loss + weight * level.abs().mean()
