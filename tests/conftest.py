@@ -29,7 +29,7 @@ CONFIGURATIONS: dict[str, tuple[str | None, dict[str, bool]]] = {
     "default": (None, {}),
     "no-subgroups": (None, {"subgroups": False}),
     "default-limits": (None, {"default_limits": True}),
-    # Tables in buffers, staging, the GPU shapes of rasterizer, sort and hash gradients.
+    # Tables in buffers, the GPU shapes of rasterizer, sort and hash gradients.
     "gpu-shape": ("discrete", {}),
     "gpu": ("discrete", {"default_limits": True}),  # gpu-shape and default-limits at once
 }

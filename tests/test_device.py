@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import re
 import subprocess
@@ -141,9 +140,9 @@ def test_adapters_are_ordered(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_only_features_with_a_use_are_requested_and_no_float_atomics() -> None:
     adapter = _Adapter("soft", "CPU")
     Device(adapter, SOFTWARE)
-    assert adapter.requests[0]["required_features"] == ["mappable-primary-buffers", "subgroup"]
+    assert adapter.requests[0]["required_features"] == ["subgroup"]
     Device(adapter, SOFTWARE, subgroups=False)
-    assert adapter.requests[1]["required_features"] == ["mappable-primary-buffers"]
+    assert adapter.requests[1]["required_features"] == []
 
 
 def test_limits_are_the_webgpu_defaults_and_larger_bindings() -> None:
@@ -162,17 +161,6 @@ def test_an_adapter_below_the_limits_is_refused() -> None:
     expected = "'Chip Graphics' offers max-compute-workgroup-storage-size = 8192, but 16384"
     with pytest.raises(NoAdapterError, match=expected):
         Device(adapter, INTEGRATED)
-
-
-def test_only_cpu_devices_are_mapped() -> None:
-    """The host reads an integrated GPU's memory slowly."""
-    adapter = _Adapter("any", "CPU")
-    assert Device(adapter, SOFTWARE).mappable
-    for info in (INTEGRATED, DISCRETE, dataclasses.replace(DISCRETE, kind="other")):
-        assert not Device(adapter, info).mappable
-        assert adapter.requests[-1]["required_features"] == ["subgroup"]
-    adapter.features.discard("mappable-primary-buffers")
-    assert not Device(adapter, SOFTWARE).mappable
 
 
 # This machine's

@@ -13,7 +13,7 @@ from lapgs_wgpu.errors import NoAdapterError
 from lapgs_wgpu.gpu.cffi_patch import parse_named_types_only
 
 # Optional features; each has a fallback.
-_WANTED_FEATURES = ("subgroup", "mappable-primary-buffers", "timestamp-query")
+_WANTED_FEATURES = ("subgroup", "timestamp-query")
 
 # WebGPU's default limits, which suffice for every kernel; larger bindings are used if the adapter has them.
 _DEFAULT_LIMITS = {
@@ -144,10 +144,7 @@ class Device:
 
     wgpu_device, queue: wgpu's objects.
     textures: whether tables are read through textures (gpu/shader), which is much faster on Mesa's software driver.
-    waits: whether the native library may wait for the device. On Metal it would wait for ever once macOS has killed a
-        command buffer (gfx-rs/wgpu#9531), so there the host polls.
     watchdog: whether the driver ends a submission that takes seconds, as on Windows and macOS (all but CPU devices).
-    mappable: whether buffers can be mapped without a staging copy (CPU devices).
     recording: the Recording in which is taken down what is done now; None where it is not.
     generation: number of buffers that pools have made: what was recorded before the last one may use a freed one.
     max_loop_turns: number of iterations, of all loops of an invocation together, after which the driver ends it; None
@@ -159,10 +156,6 @@ class Device:
         features = {name for name in _WANTED_FEATURES if name in adapter.features}
         if not subgroups:
             features.discard("subgroup")
-        if info.kind != "cpu":
-            # Kernels are slow on memory of the host, and the host reads memory of an integrated device at a few hundred
-            # MB/s, since it is write-combined (gpu-allocator#311).
-            features.discard("mappable-primary-buffers")
         limits = dict(_DEFAULT_LIMITS)
         if not default_limits:
             limits |= {name: adapter.limits[name] for name in _RAISED_LIMITS}
@@ -182,8 +175,6 @@ class Device:
         self.features = features
         self.is_cpu = info.kind == "cpu"
         self.watchdog = not self.is_cpu
-        self.waits = info.backend != "Metal"
-        self.mappable = "mappable-primary-buffers" in features
         self.textures = self.is_cpu and limits.get("max-storage-textures-per-shader-stage", 0) >= 8
         self.max_loop_turns = SOFTWARE_LOOP_TURNS if self.is_cpu else None
         self.kernel_cache: dict[Any, Any] = {}

@@ -20,7 +20,7 @@ from torch import Tensor
 from lapgs_wgpu.errors import NumericalError
 from lapgs_wgpu.gpu.array import read_all
 from lapgs_wgpu.gpu.kernel import Commands
-from lapgs_wgpu.gpu.later import Later, Ring
+from lapgs_wgpu.gpu.later import Later
 from lapgs_wgpu.motion.passes.samples import Samples
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.drawing import Drawing
@@ -38,7 +38,6 @@ from lapgs_wgpu.train.step_result import Measured, Scheduled
 from lapgs_wgpu.train.view_order import Draws
 
 IN_FLIGHT = 2  # steps that are submitted and not waited for
-_RING_BYTES = 8192
 _OVERFLOW = 1 << 31  # close_guard.wgsl
 
 
@@ -91,7 +90,6 @@ class ResidentStep:
         self._truth, self._draws, self._time_count = truth, draws, time_count
         self._passes = ResidentPasses(config, scene, learners)
         self.parameters = self._passes.parameters
-        self._ring = Ring(scene.device, _RING_BYTES)
         self._flying: deque[Flying] = deque()
         self._statistics_on_host = True
         self.settled = 0
@@ -282,7 +280,7 @@ class ResidentStep:
         task.counts = dict(self.parameters.steps)
         with Commands(self._scene.device, whole=True) as commands:
             flying.drawing, told = self._passes.record(commands, task, truth, judged=judged)
-            flying.later = self._ring.record(commands, told)
+            flying.later = Later(commands, told)
         flying.later.submitted()
         return flying
 
