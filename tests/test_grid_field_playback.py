@@ -129,4 +129,4 @@ def test_what_the_device_does_not_evaluate(device: Device) -> None:
     for changes in ({"kind": "static"}, {"kind": "mlp"}, {"kind": "hexplane"}, {"depth": 1}):
         assert not runs_on_device(replace(OURS, **changes), device)
     too_long = runs_on_device(replace(FieldConfig(), width=4096, dynamics=256), device)
-    assert too_long == (device.max_loop_turns is None)  # a loop for Mesa's software driver
+    assert too_long != device.is_cpu  # a loop for Mesa's software driver

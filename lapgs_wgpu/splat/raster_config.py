@@ -8,7 +8,7 @@ from lapgs_wgpu.gpu.device import SOFTWARE_LOOP_TURNS, Device
 from lapgs_wgpu.gpu.probe_subgroup import subgroup_size
 
 # Per band, on devices that limit loops: loops over the tiles of a splat take one iteration per tile, and a splat may
-# cover all. Below the `max_loop_turns` of every device, and below the workgroups of one dimension, which a counted
+# cover all. Below SOFTWARE_LOOP_TURNS, and below the workgroups of one dimension, which a counted
 # dispatch does not fold into two.
 MAX_BAND_TILES = 60_000
 
@@ -58,11 +58,11 @@ class RasterConfig:
         return self.tile_defines | values | flags
 
 
-def cpu_config(subgroup_size: int, max_loop_turns: int = SOFTWARE_LOOP_TURNS) -> RasterConfig:
+def cpu_config(subgroup_size: int) -> RasterConfig:
     """Return the configuration for processors: a workgroup is one vector of the processor, so that no barrier waits."""
     lanes = 16 if subgroup_size == 16 else 8
     subgroups = subgroup_size >= lanes
-    round_splats = (max_loop_turns + 1) // (SUBGROUP_TURNS if subgroups else PLAIN_TURNS)
+    round_splats = (SOFTWARE_LOOP_TURNS + 1) // (SUBGROUP_TURNS if subgroups else PLAIN_TURNS)
     return RasterConfig(8, 8, lanes, subgroups, lane_runs=True, round_splats=round_splats)
 
 
@@ -75,4 +75,4 @@ def gpu_config(subgroup_size: int) -> RasterConfig:
 def raster_config(device: Device) -> RasterConfig:
     """Return the configuration for this adapter."""
     size = subgroup_size(device)
-    return gpu_config(size) if device.max_loop_turns is None else cpu_config(size, device.max_loop_turns)
+    return cpu_config(size) if device.is_cpu else gpu_config(size)

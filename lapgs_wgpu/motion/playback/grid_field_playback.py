@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.gpu.array import DeviceArray
-from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.device import SOFTWARE_LOOP_TURNS, Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.config import GEOMETRY, FieldConfig, static_grid, temporal_grids
@@ -32,11 +32,11 @@ _PLACES = np.array([*range(4), 8, 9, 10, *range(4, 8), 12, 13, 14, 16, 17, 18, 1
 
 def runs_on_device(config: FieldConfig, device: Device) -> bool:
     """Return whether `GridFieldPlayback` supports this field on the device."""
-    if not config.decodes_on_device or device.max_loop_turns is None:
+    if not config.decodes_on_device or not device.is_cpu:
         return config.decodes_on_device
     sizes = _Sizes(config)
     # Iterations of a round of 8 channels (on CPU devices), with the loops over channels and the round itself.
-    return (sizes.width // 8 + 1) * (sizes.still_quads + sizes.moving_quads + 11) < device.max_loop_turns
+    return (sizes.width // 8 + 1) * (sizes.still_quads + sizes.moving_quads + 11) < SOFTWARE_LOOP_TURNS
 
 
 class _Sizes:
