@@ -13,7 +13,7 @@ import pytest
 from lapgs_wgpu.errors import NoAdapterError
 from lapgs_wgpu.gpu import device as module
 from lapgs_wgpu.gpu.device import Device, DeviceInfo, list_devices, open_device
-from lapgs_wgpu.gpu.probe_subgroup import subgroup_size
+from lapgs_wgpu.splat.raster_config import subgroup_size
 
 DISCRETE = DeviceInfo("Fast Card 9000", "discrete", "Vulkan", "v1")
 INTEGRATED = DeviceInfo("Chip Graphics", "integrated", "Vulkan", "v2")

@@ -23,9 +23,8 @@ from helpers.scenes import (
 from torch import Tensor
 
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.gpu.probe_subgroup import subgroup_size
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.splat.raster_config import RasterConfig, cpu_config, gpu_config
+from lapgs_wgpu.splat.raster_config import RasterConfig, cpu_config, gpu_config, subgroup_size
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 from dataclasses import dataclass
 from typing import Any
@@ -59,14 +60,11 @@ class Buffer:
         self.number = next(_numbers)  # unique, also among freed buffers
         self.version = 0  # number of writes: tells whether a texture made from the buffer is out of date
         self._textures: dict[str, _Texture] = {}
-        self._download: Any = None
 
-    @property
+    @functools.cached_property
     def download(self) -> Any:
         """The staging buffer for reading."""
-        if self._download is None:
-            self._download = self._create(wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.COPY_DST)
-        return self._download
+        return self._create(wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.COPY_DST)
 
     def _create(self, usage: int) -> Any:
         with translated_errors(self.device, f"buffer {self.label!r}", self.nbytes):

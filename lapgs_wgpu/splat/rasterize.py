@@ -14,11 +14,10 @@ from lapgs_wgpu.gpu.array import DeviceArray, read_all
 from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.splat.constants import CONSTANTS
+from lapgs_wgpu.splat.constants import COLOR, CONSTANTS, MEAN, OPACITY, RADIUS
 from lapgs_wgpu.splat.drawing import Drawing, camera_gradient
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterizer import Rasterizer
-from lapgs_wgpu.splat.splat_layout import COLOR, MEAN, OPACITY, RADIUS
 
 
 class Rendering(NamedTuple):
