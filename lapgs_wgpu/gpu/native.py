@@ -24,7 +24,6 @@ from lapgs_wgpu.gpu.device import Device
 
 # The longest wait for a graphics card, seconds: macOS kills work long before, and the library tells nobody.
 LONGEST_WAIT = 60.0
-_SHORTEST_SLEEP, _LONGEST_SLEEP = 50e-6, 1e-3  # seconds between two polls
 _numbers = itertools.count(1)  # of mappings
 _statuses: dict[int, int] = {}  # of mappings that are done, by number
 
@@ -69,17 +68,17 @@ class Mapping:
         It polls, since the library would wait for all that was submitted, on Metal for ever once macOS has killed a
         command buffer (gfx-rs/wgpu#9531).
         """
-        device, deadline, pause = self._device, time.monotonic() + LONGEST_WAIT, _SHORTEST_SLEEP
+        device, begun = self._device, time.monotonic()
         while self._number not in _statuses:
             lib.wgpuDevicePoll(device.wgpu_device._internal, False, ffi.NULL)
             if self._number in _statuses:
                 break
-            if device.watchdog and time.monotonic() > deadline:
+            waited = time.monotonic() - begun
+            if device.watchdog and waited > LONGEST_WAIT:
                 raise DeviceLostError(
                     f"{device.info.name} has not answered for {LONGEST_WAIT:.0f} seconds: its driver has ended the work"
                 )
-            time.sleep(pause)
-            pause = min(2 * pause, _LONGEST_SLEEP)
+            time.sleep(min(1e-3, waited / 10))
 
     def __enter__(self) -> NDArray[np.uint8]:
         with raising("wgpuDevicePoll"):
