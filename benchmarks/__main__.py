@@ -33,7 +33,7 @@ from shares import bench_shares
 from step import StepReport, bench_step
 
 from lapgs_wgpu.gpu.device import Device, open_device
-from lapgs_wgpu.gpu.probe_subgroup import subgroup_size
+from lapgs_wgpu.splat.raster_config import subgroup_size
 from lapgs_wgpu.train.presets import load_config
 from viewer import bench_viewer, print_viewer
 

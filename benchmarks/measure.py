@@ -109,9 +109,9 @@ def recording() -> Iterator[list[Event]]:
         events.append(Event("write", self.label, values.nbytes))
         write(self, values, offset)
 
-    def counted_mapping(device: Any, buffer: Any, mode: int, offset: int, nbytes: int) -> Any:
+    def counted_mapping(device: Any, buffer: Any, offset: int, nbytes: int) -> Any:
         events.append(Event("read", buffer.label, nbytes))  # `array` maps for nothing else
-        return native.Mapping(device, buffer, mode, offset, nbytes)
+        return native.Mapping(device, buffer, offset, nbytes)
 
     with (
         mock.patch.object(Commands, "dispatch_grid", counted_dispatch),

@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 
 from lapgs_wgpu.gpu.device import Device, open_device
-from lapgs_wgpu.gpu.probe_subgroup import subgroup_size
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.constants import CONSTANTS
+from lapgs_wgpu.splat.raster_config import subgroup_size
 from lapgs_wgpu.splat.rasterize import rasterize, rasterizer_of
 from lapgs_wgpu.splat.rotation import rotation_matrices
 

@@ -8,13 +8,13 @@
 
 struct Part { first: u32, count: u32 }   // the Gaussians whose colors are bound
 
-@group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<uniform> part: Part;
 // (count, 3), or (count, SH coefficients, 3)
 #table 2 colors: f32
 #table 3 tile_counts: u32
 @group(0) @binding(4) var<storage, read_write> splats: array<f32>;
 #ifdef SH
+@group(0) @binding(0) var<uniform> frame: Frame;
 #table 5 means: f32
 #endif
 

@@ -8,7 +8,9 @@
 #ifdef ROUND_SPLATS
 // [2]: whether a list of this image asks for more rounds. A round ends after ROUND_SPLATS splats; what a tile has by then
 // lies in the image, the background not yet under it, and the sign of the transmittance says whether a pixel has stopped.
+#ifdef LAST_ROUND
 @group(0) @binding(6) var<storage, read_write> needed: array<u32>;
+#endif
 #endif
 #import common/index
 #import common/raster

@@ -14,33 +14,38 @@ import dataclasses
 import os
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
 from synthetic import write_synthetic
 
 from lapgs_wgpu.data import Dataset, load_dataset
-from lapgs_wgpu.gpu.device import Device, _adapters, _matches
+from lapgs_wgpu.gpu.device import _DEFAULT_LIMITS, Device, _adapters, _matches
 from lapgs_wgpu.splat import rasterize as rasterize_module
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 
-# What the adapter is taken for, and how it is opened.
-CONFIGURATIONS: dict[str, tuple[str | None, dict[str, bool]]] = {
+# What the adapter is taken for, and what it offers instead.
+_DEFAULT = {"limits": _DEFAULT_LIMITS | {"max-storage-textures-per-shader-stage": 4}}
+CONFIGURATIONS: dict[str, tuple[str | None, dict[str, Any]]] = {
     "default": (None, {}),
-    "no-subgroups": (None, {"subgroups": False}),
-    "default-limits": (None, {"default_limits": True}),
-    # Tables in buffers, staging, the GPU shapes of rasterizer, sort and hash gradients.
+    "no-subgroups": (None, {"features": ()}),
+    "default-limits": (None, _DEFAULT),
+    # Tables in buffers, the GPU shapes of rasterizer, sort and hash gradients.
     "gpu-shape": ("discrete", {}),
-    "gpu": ("discrete", {"default_limits": True}),  # gpu-shape and default-limits at once
+    "gpu": ("discrete", _DEFAULT),  # gpu-shape and default-limits at once
 }
 
 
 def open_test_device(configuration: str) -> Device:
     """The adapter that LAPGS_DEVICE names, else the first, in one of the CONFIGURATIONS."""
-    kind, switches = CONFIGURATIONS[configuration]
+    kind, offered = CONFIGURATIONS[configuration]
     wanted = os.environ.get("LAPGS_DEVICE", "")
     info, adapter = next(pair for pair in _adapters() if not wanted or _matches(pair[0], wanted))
-    return Device(adapter, dataclasses.replace(info, kind=kind or info.kind), **switches)
+    offered = {"features": adapter.features, "limits": adapter.limits} | offered
+    taken = SimpleNamespace(request_device_sync=adapter.request_device_sync, **offered)
+    return Device(taken, dataclasses.replace(info, kind=kind or info.kind))
 
 
 pytest.register_assert_rewrite("helpers")

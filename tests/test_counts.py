@@ -17,7 +17,6 @@ from wgpu.backends.wgpu_native import GPUBuffer, GPUQueue
 
 from lapgs_wgpu.data import Dataset
 from lapgs_wgpu.gpu import array as array_module
-from lapgs_wgpu.gpu import buffer as buffer_module
 from lapgs_wgpu.gpu import native
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
@@ -51,9 +50,9 @@ def events(monkeypatch: pytest.MonkeyPatch) -> list[Event]:
     watch(monkeypatch, lambda name: seen.append(Event("dispatch", name, 0)))
     write_buffer, read_buffer = GPUQueue.write_buffer, GPUQueue.read_buffer
 
-    def mapping(device: Any, buffer: GPUBuffer, mode: int, offset: int, nbytes: int) -> Any:
-        seen.append(Event("read" if mode == native.READ else "write", buffer.label, nbytes))
-        return native.Mapping(device, buffer, mode, offset, nbytes)
+    def mapping(device: Any, buffer: GPUBuffer, offset: int, nbytes: int) -> Any:
+        seen.append(Event("read", buffer.label, nbytes))
+        return native.Mapping(device, buffer, offset, nbytes)
 
     def writing(self: GPUQueue, buffer: GPUBuffer, offset: int, data: Any, *rest: Any) -> Any:
         seen.append(Event("write", buffer.label, memoryview(data).nbytes))
@@ -63,7 +62,6 @@ def events(monkeypatch: pytest.MonkeyPatch) -> list[Event]:
         raise AssertionError("queue.read_buffer is a hundred times slower than mapping")
 
     monkeypatch.setattr(array_module, "Mapping", mapping)
-    monkeypatch.setattr(buffer_module, "Mapping", mapping)
     monkeypatch.setattr(GPUQueue, "write_buffer", writing)
     monkeypatch.setattr(GPUQueue, "read_buffer", reading)
     assert read_buffer is not GPUQueue.read_buffer

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import open_test_device
+import wgpu
 from numpy.typing import NDArray
 
 from lapgs_wgpu.gpu import shader
@@ -38,18 +38,6 @@ def wgsl(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
     return texts
 
 
-@pytest.fixture(scope="module", params=["as it is", "mapped", "staged"])
-def either(device: Device, configuration: str, request: pytest.FixtureRequest) -> Device:
-    """The device, and one of each way to its memory."""
-    if request.param == "as it is":
-        return device
-    other = open_test_device(configuration)
-    if request.param == "mapped" and "mappable-primary-buffers" not in other.features:
-        pytest.skip("this adapter cannot map its buffers")
-    other.mappable = request.param == "mapped"
-    return other
-
-
 def numbers(device: Device, values: Any, label: str = "numbers") -> DeviceArray:
     return DeviceArray.upload(device, label, np.asarray(values, np.uint32))
 
@@ -63,14 +51,14 @@ def add(device: Device) -> Kernel:
 
 def test_missing_and_unknown_arrays_are_named(device: Device, wgsl: dict[str, str]) -> None:
     a = numbers(device, [1])
-    expected = r"shaders/add\.wgsl: missing arrays \['sum'\], unknown \['summ'\]"
+    expected = r"shaders/add\.wgsl: arrays that only one side has: \['sum', 'summ'\]"
     with Commands(device) as commands, pytest.raises(ShaderError, match=expected):
         commands.dispatch(add(device), 1, a=a, summ=a)
 
 
 def test_another_dtype_is_refused(device: Device, wgsl: dict[str, str]) -> None:
     a, floats = numbers(device, [1]), DeviceArray.empty(device, "floats", (4,))
-    with Commands(device) as commands, pytest.raises(ShaderError, match=r"add\.wgsl: sum holds u32, got float32"):
+    with Commands(device) as commands, pytest.raises(ShaderError, match="sum holds array<u32>, got float32"):
         commands.dispatch(add(device), 1, a=a, sum=floats)
 
 
@@ -91,9 +79,11 @@ def test_a_buffer_beyond_the_limit_is_refused(device: Device) -> None:
 
 
 def test_too_many_storage_buffers_are_counted(device: Device, wgsl: dict[str, str]) -> None:
-    declare = "@group(0) @binding({0}) var<storage, read> b{0}: array<u32>;\n"
-    wgsl["many"] = "".join(declare.format(i) for i in range(9)) + "@compute @workgroup_size(1) fn main() {}"
-    with pytest.raises(ShaderError, match=r"shaders/many\.wgsl binds 9 storage buffers; the device allows 8"):
+    declare = "@group(0) @binding({0}) var<storage, read_write> b{0}: array<u32>;\n"
+    uses = " + ".join(f"b{i}[0]" for i in range(1, 9))
+    body = f"@compute @workgroup_size(1) fn main() {{ b0[0] = {uses}; }}"
+    wgsl["many"] = "".join(declare.format(i) for i in range(9)) + body
+    with pytest.raises(ShaderError, match=r"(?s)shaders/many\.wgsl does not compile:.* limit is 8, count was 9"):
         Kernel(device, "many", {})
 
 
@@ -127,10 +117,10 @@ def test_what_is_bound_follows_a_buffer_that_grew(device: Device, wgsl: dict[str
         a = pool.upload("a", np.full(4 * size, size, np.uint32))
         with Commands(device) as commands:
             commands.dispatch(kernel, 1, a=a, sum=total)
-        assert len(total.buffer.bound) == len(a.buffer.bound) == 1
+        assert len(kernel._groups) == 1
     assert total.read()[0] == sum(range(1, 100))
     del pool, a
-    assert not total.buffer.bound
+    assert not kernel._groups
 
 
 def test_uniforms_are_laid_out_as_wgsl_reads_them(device: Device, wgsl: dict[str, str]) -> None:
@@ -295,10 +285,9 @@ fn main() { target_[0] = source_at(0u); }
 
 
 @pytest.mark.parametrize("count", [1, 3, 16_384, 16_385, 100_001])
-def test_what_is_written_is_read(either: Device, count: int) -> None:
-    """Up to 64 KiB, and beyond, where a staged write takes another way."""
+def test_what_is_written_is_read(device: Device, count: int) -> None:
     values = np.random.default_rng(count).integers(0, 1 << 32, count, dtype=np.uint32)
-    buffer = DeviceArray.empty(either, "values", (count,), "uint32")
+    buffer = DeviceArray.empty(device, "values", (count,), "uint32")
     assert not buffer.read().any()
     buffer.write(values)
     np.testing.assert_array_equal(buffer.read(), values)
@@ -307,9 +296,9 @@ def test_what_is_written_is_read(either: Device, count: int) -> None:
 
 
 @pytest.mark.parametrize("count", [1, 3, 17_001])
-def test_writing_a_part_leaves_the_rest(either: Device, count: int) -> None:
+def test_writing_a_part_leaves_the_rest(device: Device, count: int) -> None:
     before = np.arange(20_000, dtype=np.uint32)
-    buffer = numbers(either, before)
+    buffer = numbers(device, before)
     buffer.rows(200, count).write(np.full(count, 7, np.uint32))
     after = buffer.read()
     before[200 : 200 + count] = 7
@@ -317,9 +306,9 @@ def test_writing_a_part_leaves_the_rest(either: Device, count: int) -> None:
     np.testing.assert_array_equal(buffer.rows(198, 15).read(), before[198:213])
 
 
-def test_types_and_shapes_are_kept(either: Device) -> None:
+def test_types_and_shapes_are_kept(device: Device) -> None:
     values = np.random.default_rng(0).standard_normal((7, 3)).astype(np.float32)
-    array = DeviceArray.upload(either, "values", values)
+    array = DeviceArray.upload(device, "values", values)
     np.testing.assert_array_equal(array.read(), values)
     array.rows(0, 0).write(np.zeros((0, 3), np.float32))
     assert array.rows(0, 0).read().shape == (0, 3)
@@ -329,37 +318,34 @@ def test_types_and_shapes_are_kept(either: Device) -> None:
             array.write(wrong)
 
 
-def test_several_buffers_are_read_at_once(either: Device) -> None:
-    a, b = numbers(either, [1, 2, 3, 4, 5]), numbers(either, range(100))
+def test_several_buffers_are_read_at_once(device: Device) -> None:
+    a, b = numbers(device, [1, 2, 3, 4, 5]), numbers(device, range(100))
     assert [array.tolist() for array in read_all([b.rows(2, 2), a, b.rows(96, 1)])] == [[2, 3], [1, 2, 3, 4, 5], [96]]
 
 
-def test_reading_and_writing_beyond_the_end_is_refused(either: Device) -> None:
-    buffer = numbers(either, range(4), "short")
+def test_reading_and_writing_beyond_the_end_is_refused(device: Device) -> None:
+    buffer = numbers(device, range(4), "short")
     with pytest.raises(ValueError, match="short: 20 bytes do not fit into 16"):
         buffer.buffer.write(np.arange(5, dtype=np.uint32))
     with pytest.raises(ValueError, match="short: 24 bytes do not fit into 16"):
         buffer.buffer.write(np.arange(4, dtype=np.uint32), offset=8)
-    with pytest.raises(ValueError, match="short: reading 24 bytes of 16"):
+    with pytest.raises(wgpu.GPUValidationError):
         DeviceArray(buffer.buffer, (5,), "uint32").read()
 
 
-def test_writes_and_kernels_take_turns(either: Device, wgsl: dict[str, str]) -> None:
+def test_writes_and_kernels_take_turns(device: Device, wgsl: dict[str, str]) -> None:
     """A write waits for the kernels before it, and a read too."""
-    kernel, count = add(either), 20_000
-    a, total = numbers(either, np.zeros(count)), numbers(either, np.zeros(count))
+    kernel, count = add(device), 20_000
+    a, total = numbers(device, np.zeros(count)), numbers(device, np.zeros(count))
     for value in range(5):
         a.write(np.full(count, value, np.uint32))
-        with Commands(either) as commands:
+        with Commands(device) as commands:
             commands.dispatch(kernel, count, a=a, sum=total)
     assert set(total.read().tolist()) == {10}
 
 
-@pytest.mark.parametrize("waits", [True, False])
-def test_threads_read_and_write_at_once(configuration: str, wgsl: dict[str, str], waits: bool) -> None:
-    """Whichever thread polls, each gets its own answer. waits: in the native library, or by polling, as on Metal."""
-    device = open_test_device(configuration)
-    device.waits = waits
+def test_threads_read_and_write_at_once(device: Device, wgsl: dict[str, str]) -> None:
+    """Whichever thread polls, each gets its own answer."""
     kernel, right = add(device), [0, 0]
 
     def work(which: int) -> None:

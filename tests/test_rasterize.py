@@ -23,9 +23,8 @@ from helpers.scenes import (
 from torch import Tensor
 
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.gpu.probe_subgroup import subgroup_size
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.splat.raster_config import RasterConfig, cpu_config, gpu_config
+from lapgs_wgpu.splat.raster_config import RasterConfig, cpu_config, gpu_config, subgroup_size
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 
@@ -234,9 +233,9 @@ def test_only_the_backward_pass_is_cut(device: Device, use: Callable[[Rasterizer
     if subgroup_size(device) < 8:
         pytest.skip("this device has no subgroups, or none of 8 lanes")
     scene, camera = random_scene(300, 8, size=0.3), oblique_camera(20, 12)
-    use(Rasterizer(device, config=cpu_config(0, 255)))
+    use(Rasterizer(device, config=replace(cpu_config(0), round_splats=8)))
     expected = step(scene, camera, device)
-    rasterizer = use(Rasterizer(device, config=cpu_config(8, 255)))
+    rasterizer = use(Rasterizer(device, config=replace(cpu_config(8), round_splats=128)))
     mismatches = iter([True])
 
     def mismatch(name: str, drawn: Any) -> bool:

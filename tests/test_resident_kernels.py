@@ -22,9 +22,9 @@ from lapgs_wgpu.motion.fields.dynamics import dynamics_loss
 from lapgs_wgpu.motion.fields.laplacian import VARIANCE_FLOOR, VARIANCE_SPREAD, LaplacianMotion
 from lapgs_wgpu.motion.passes.samples import SamplePasses, Samples
 from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.constants import MEAN, RADIUS, SPLAT_FLOATS
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterizer import Rasterizer
-from lapgs_wgpu.splat.splat_layout import MEAN, RADIUS, SPLAT_FLOATS
 from lapgs_wgpu.train.camera_refinement import CameraRefinement, scene_points
 from lapgs_wgpu.train.config import CamerasConfig, Rate
 from lapgs_wgpu.train.densify import Statistics

@@ -27,7 +27,7 @@ from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import _DEFAULT_LIMITS, _RAISED_LIMITS, Device, DeviceInfo
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.gpu.wgpu_errors import TranslatedErrors
+from lapgs_wgpu.gpu.wgpu_errors import translated_errors
 from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.train.run_folder import load_state
@@ -142,7 +142,7 @@ class _Deaf:
 def test_a_device_that_never_answers_is_given_up(doomed: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """As on Metal, where macOS kills work that takes too long and the mapping that waits for it never ends."""
     array = DeviceArray.upload(doomed, "values", np.arange(4, dtype=np.uint32))
-    doomed.waits = False
+    doomed.watchdog = True
     assert array.read().tolist() == [0, 1, 2, 3]
     monkeypatch.setattr(native, "lib", _Deaf())
     monkeypatch.setattr(native, "LONGEST_WAIT", 0.2)
@@ -152,22 +152,14 @@ def test_a_device_that_never_answers_is_given_up(doomed: Device, monkeypatch: py
     assert 0.2 <= time.monotonic() - begun < 5
 
 
-def test_only_metal_is_polled() -> None:
-    limits = dict.fromkeys((*_DEFAULT_LIMITS, *_RAISED_LIMITS), 1 << 31)
-    opened = SimpleNamespace(queue=None)
-    adapter = SimpleNamespace(features=(), limits=limits, request_device_sync=lambda **_: opened)
-    for backend, waits in (("Vulkan", True), ("D3D12", True), ("Metal", False)):
-        assert Device(adapter, DeviceInfo("Card", "integrated", backend, "")).waits == waits
-
-
 def test_other_errors_stay_what_they_are(device: Device) -> None:
-    with pytest.raises(wgpu.GPUValidationError), TranslatedErrors(device, "a test"):
+    with pytest.raises(wgpu.GPUValidationError), translated_errors(device, "a test"):
         device.wgpu_device.create_buffer(size=1 << 60, usage=wgpu.BufferUsage.STORAGE)
-    with pytest.raises(AttributeError), TranslatedErrors(device, "a test"):
+    with pytest.raises(AttributeError), translated_errors(device, "a test"):
         raise AttributeError
     with (
         pytest.raises(DeviceMemoryError, match=r"no memory left for a test of 5 MB, fewer"),
-        TranslatedErrors(device, "a test", 5_000_000),
+        translated_errors(device, "a test", 5_000_000),
     ):
         raise wgpu.GPUOutOfMemoryError("out of memory")
     assert issubclass(DeviceMemoryError, MemoryError)

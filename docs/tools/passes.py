@@ -21,9 +21,9 @@ from lapgs_wgpu.discovery.tracks import find_tracks
 from lapgs_wgpu.gpu.array import read_all
 from lapgs_wgpu.gpu.device import open_device
 from lapgs_wgpu.progress import Progress
+from lapgs_wgpu.splat.constants import COLOR, MEAN, OPACITY, RADIUS
 from lapgs_wgpu.splat.drawing import Drawing
 from lapgs_wgpu.splat.rasterize import rasterizer_of, upload_gaussians
-from lapgs_wgpu.splat.splat_layout import COLOR, MEAN, OPACITY, RADIUS
 from lapgs_wgpu.train.setup import open_dataset, resolve_data, resolve_for_dataset
 
 Picture = NDArray[np.uint8]

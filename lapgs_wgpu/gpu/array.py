@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.gpu.buffer import Buffer
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.gpu.native import READ, Mapping
-from lapgs_wgpu.gpu.wgpu_errors import TranslatedErrors
+from lapgs_wgpu.gpu.native import Mapping
+from lapgs_wgpu.gpu.wgpu_errors import translated_errors
 
 _ITEM_BYTES = {"float32": 4, "uint32": 4, "uint8": 1, "uint64": 8}
 
@@ -83,29 +83,18 @@ class DeviceArray:
 
 def read_all(arrays: Sequence[DeviceArray]) -> list[NDArray[Any]]:
     """Read several arrays with one wait. Their offsets must be multiples of 8 bytes."""
-    sources = []
-    encoder = None
-    for array in arrays:
-        buffer, offset, nbytes = array.buffer, array.offset, array.nbytes
-        size = max(8, (nbytes + 7) & ~7)
-        if offset + size > buffer.nbytes:
-            raise ValueError(f"{buffer.label}: reading {offset + size} bytes of {buffer.nbytes}")
-        if buffer.device.mappable:
-            sources.append((buffer.wgpu_buffer, offset, size, nbytes))
-            continue
-        encoder = encoder or buffer.device.wgpu_device.create_command_encoder()
-        encoder.copy_buffer_to_buffer(buffer.wgpu_buffer, offset, buffer.download, offset, size)
-        sources.append((buffer.download, offset, size, nbytes))
-    if encoder is not None:
-        device = arrays[0].buffer.device
-        with TranslatedErrors(device, "what is read back"):
-            device.queue.submit([encoder.finish()])
+    device = arrays[0].buffer.device
+    places = [(array.offset, max(8, (array.nbytes + 7) & ~7)) for array in arrays]
+    with translated_errors(device, "what is read back"):
+        encoder = device.wgpu_device.create_command_encoder()
+        for array, (offset, size) in zip(arrays, places, strict=True):
+            encoder.copy_buffer_to_buffer(array.buffer.wgpu_buffer, offset, array.buffer.download, offset, size)
+        device.queue.submit([encoder.finish()])
     out = []
-    for (source, offset, size, nbytes), array in zip(sources, arrays, strict=True):
-        device = array.buffer.device
+    for array, (offset, size) in zip(arrays, places, strict=True):
         with (
-            TranslatedErrors(device, f"what is read from buffer {array.buffer.label!r}", nbytes),
-            Mapping(device, source, READ, offset, size) as content,
+            translated_errors(device, f"what is read from buffer {array.buffer.label!r}", array.nbytes),
+            Mapping(device, array.buffer.download, offset, size) as content,
         ):
-            out.append(content[:nbytes].copy().view(array.dtype).reshape(array.shape))
+            out.append(content[: array.nbytes].copy().view(array.dtype).reshape(array.shape))
     return out

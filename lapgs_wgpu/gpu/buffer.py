@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
-import weakref
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,33 +13,13 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import DeviceMemoryError
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.gpu.native import WRITE, Mapping, TextureCopies
+from lapgs_wgpu.gpu.native import TextureCopies
 from lapgs_wgpu.gpu.shader import TABLE_TYPES, TABLE_WIDTH
-from lapgs_wgpu.gpu.wgpu_errors import TranslatedErrors
+from lapgs_wgpu.gpu.wgpu_errors import translated_errors
 
 _STORAGE = wgpu.BufferUsage.STORAGE | wgpu.BufferUsage.UNIFORM | wgpu.BufferUsage.COPY_SRC | wgpu.BufferUsage.COPY_DST
-_MAPPABLE = wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.MAP_WRITE
 _MOST_ROWS = 8192  # of a texture, by WebGPU's default limits
 _numbers = itertools.count()
-
-
-@dataclass(eq=False)
-class BindGroup:
-    """A wgpu bind group, and its entry in the kernel's cache.
-
-    native: the library's; wgpu keeps it alive. textures: kept alive, since their ids are part of the key.
-    """
-
-    native: Any
-    wgpu: Any
-    textures: dict[str, Any]
-    store: dict[Any, BindGroup]
-    key: Any
-
-
-def _forget(bound: weakref.WeakSet[BindGroup]) -> None:
-    for group in list(bound):
-        group.store.pop(group.key, None)
 
 
 def _height(rows: int) -> int:
@@ -66,8 +46,7 @@ class _Texture:
 class Buffer:
     """A storage or uniform buffer of `nbytes` (rounded up to 16), initially zero.
 
-    On CPU devices the buffer is mapped itself, and the processor reads and writes it with one copy. Others are written
-    through the queue, and read through a staging buffer of the same size, which is kept.
+    It is written through the queue, and read through a staging buffer of the same size, which is kept.
     """
 
     def __init__(self, device: Device, nbytes: int, label: str) -> None:
@@ -77,24 +56,18 @@ class Buffer:
         if self.nbytes > device.limits["max-buffer-size"]:
             limit = device.limits["max-buffer-size"]
             raise DeviceMemoryError(f"buffer {label!r} needs {self.nbytes} bytes, and one of this device holds {limit}")
-        self.wgpu_buffer = self._create(_STORAGE | (_MAPPABLE if device.mappable else 0))
+        self.wgpu_buffer = self._create(_STORAGE)
         self.number = next(_numbers)  # unique, also among freed buffers
-        # Bind groups keep device memory alive: they are dropped with the buffer.
-        self.bound: weakref.WeakSet[BindGroup] = weakref.WeakSet()
-        weakref.finalize(self, _forget, self.bound).atexit = False
         self.version = 0  # number of writes: tells whether a texture made from the buffer is out of date
         self._textures: dict[str, _Texture] = {}
-        self._download: Any = None
 
-    @property
+    @functools.cached_property
     def download(self) -> Any:
-        """The staging buffer for reading, where buffers are not mapped themselves."""
-        if self._download is None:
-            self._download = self._create(wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.COPY_DST)
-        return self._download
+        """The staging buffer for reading."""
+        return self._create(wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.COPY_DST)
 
     def _create(self, usage: int) -> Any:
-        with TranslatedErrors(self.device, f"buffer {self.label!r}", self.nbytes):
+        with translated_errors(self.device, f"buffer {self.label!r}", self.nbytes):
             return self.device.wgpu_device.create_buffer(label=self.label, size=self.nbytes, usage=usage)
 
     def write(self, array: NDArray[Any], offset: int = 0) -> None:
@@ -105,12 +78,8 @@ class Buffer:
         if data.nbytes == 0:
             return
         self.version += 1
-        with TranslatedErrors(self.device, f"what is written to buffer {self.label!r}", data.nbytes):
-            if not self.device.mappable:
-                self.device.queue.write_buffer(self.wgpu_buffer, offset, data)
-                return
-            with Mapping(self.device, self.wgpu_buffer, WRITE, offset, (data.nbytes + 7) & ~7) as content:
-                content[: data.nbytes] = data
+        with translated_errors(self.device, f"what is written to buffer {self.label!r}", data.nbytes):
+            self.device.queue.write_buffer(self.wgpu_buffer, offset, data)
 
     def texture(self, texel_format: str, offset: int, size: int) -> tuple[Any, TextureCopies | None]:
         """Return a view of a texture that holds `size` bytes from `offset` on, in rows of TABLE_WIDTH texels.
@@ -123,7 +92,7 @@ class Buffer:
         held = self._textures.get(texel_format)
         if held is None or held.rows < rows:
             rows = _height(rows)
-            with TranslatedErrors(self.device, f"the texture of buffer {self.label!r}", rows * TABLE_WIDTH * texel):
+            with translated_errors(self.device, f"the texture of buffer {self.label!r}", rows * TABLE_WIDTH * texel):
                 texture = self.device.wgpu_device.create_texture(
                     label=self.label,
                     size=(TABLE_WIDTH, rows, 1),

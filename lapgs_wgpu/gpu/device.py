@@ -7,13 +7,12 @@ import functools
 import os
 import sys
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from lapgs_wgpu.errors import NoAdapterError
 from lapgs_wgpu.gpu.cffi_patch import parse_named_types_only
 
-# Optional features; each has a fallback.
-_WANTED_FEATURES = ("subgroup", "mappable-primary-buffers", "timestamp-query")
+_WANTED_FEATURES = ("subgroup", "timestamp-query")
 
 # WebGPU's default limits, which suffice for every kernel; larger bindings are used if the adapter has them.
 _DEFAULT_LIMITS = {
@@ -29,13 +28,12 @@ _RAISED_LIMITS = ("max-storage-buffer-binding-size", "max-buffer-size", "max-sto
 # Mesa's software driver silently ends an invocation after this many iterations of all its loops together.
 SOFTWARE_LOOP_TURNS = 65_535
 
-INSTALL_HINT = "install the newest driver of your graphics card"
-if sys.platform == "linux":
-    INSTALL_HINT = (
-        "install a Vulkan driver for your graphics card, or Mesa's software driver, on Debian and Ubuntu: "
-        "sudo apt-get install -y mesa-vulkan-drivers libvulkan1"
-    )
-_WITHOUT_DXC = "; D3D12 adapters need dxcompiler.dll (Microsoft's DirectX Shader Compiler) in a folder of PATH"
+_INSTALL_HINTS = {
+    "linux": "install a Vulkan driver for your graphics card, or Mesa's software driver, on Debian and Ubuntu: "
+    "sudo apt-get install -y mesa-vulkan-drivers libvulkan1",
+    "win32": "install the newest driver of your graphics card; D3D12 adapters need dxcompiler.dll (Microsoft's DirectX "
+    "Shader Compiler) in a folder of PATH",
+}
 
 
 @dataclass(frozen=True)
@@ -48,50 +46,31 @@ class DeviceInfo:
     driver: str
 
 
-@dataclass(frozen=True)
-class AdapterDetails:
-    """An adapter that is not opened, and what it offers of what kernels use.
-
-    features: of the optional ones. limits: of the required and the larger ones, by WebGPU's names. too_small: offered
-    and needed value of each limit below what the kernels need; such an adapter cannot be opened.
-    """
+class AdapterDetails(NamedTuple):
+    """An adapter, its optional features, limits, and offered and needed values of limits too small for the kernels."""
 
     info: DeviceInfo
-    features: tuple[str, ...]
+    features: list[str]
     limits: dict[str, int]
     too_small: dict[str, tuple[int, int]]
 
 
-def instance_options(platform: str, dxc: str | None) -> dict[str, Any]:
+def instance_options(platform: str) -> dict[str, Any]:
     """Return options of wgpu's instance on a platform, as `sys.platform` names it.
 
-    dxc: path of dxcompiler.dll, if there is one. The compiler that D3D12 has without it, FXC, knows no subgroups and
-    refuses barriers in loops, so D3D12 is then left out.
+    D3D12 is left out without dxcompiler.dll, since its older compiler, FXC, knows no subgroups and refuses barriers in
+    loops.
     """
     # Not OpenGL: it offers the same hardware with fewer features.
     backends = ["Vulkan", "Metal", "DX12"]
     options: dict[str, Any] = {"backends": backends, "flags": ["Empty"]}
     if platform == "win32":
+        dxc = ctypes.util.find_library("dxcompiler")
         if dxc is None:
             backends.remove("DX12")
         else:
             options |= {"dx12_compiler": "Dxc", "dxc_path": dxc}
     return options
-
-
-@functools.cache
-def _options() -> dict[str, Any]:
-    return instance_options(sys.platform, _dxc() if sys.platform == "win32" else None)
-
-
-def _dxc() -> str | None:
-    """Return the path of dxcompiler.dll: beside wgpu's own library, or in a folder of PATH."""
-    from wgpu._coreutils import get_library_filename
-
-    try:
-        return str(get_library_filename("dxcompiler.dll"))
-    except RuntimeError:
-        return ctypes.util.find_library("dxcompiler")
 
 
 @functools.cache
@@ -103,7 +82,7 @@ def _instance() -> Any:
     from wgpu.backends.wgpu_native.extras import set_instance_extras
 
     parse_named_types_only(ffi)
-    set_instance_extras(**_options())
+    set_instance_extras(**instance_options(sys.platform))
     return wgpu.gpu
 
 
@@ -128,15 +107,16 @@ def list_devices() -> list[DeviceInfo]:
     return [info for info, _ in _adapters()]
 
 
+def _details(info: DeviceInfo, adapter: Any) -> AdapterDetails:
+    features = [name for name in _WANTED_FEATURES if name in adapter.features]
+    limits = {name: int(adapter.limits[name]) for name in dict.fromkeys((*_DEFAULT_LIMITS, *_RAISED_LIMITS))}
+    too_small = {name: (limits[name], value) for name, value in _DEFAULT_LIMITS.items() if limits[name] < value}
+    return AdapterDetails(info, features, limits, too_small)
+
+
 def adapter_details() -> list[AdapterDetails]:
     """List the adapters as `list_devices` does, with features and limits."""
-    found = []
-    for info, adapter in _adapters():
-        limits = {name: int(adapter.limits[name]) for name in dict.fromkeys((*_DEFAULT_LIMITS, *_RAISED_LIMITS))}
-        needed = {name: (limits[name], value) for name, value in _DEFAULT_LIMITS.items() if limits[name] < value}
-        features = tuple(name for name in _WANTED_FEATURES if name in adapter.features)
-        found.append(AdapterDetails(info, features, limits, needed))
-    return found
+    return [_details(*pair) for pair in _adapters()]
 
 
 class Device:
@@ -144,48 +124,28 @@ class Device:
 
     wgpu_device, queue: wgpu's objects.
     textures: whether tables are read through textures (gpu/shader), which is much faster on Mesa's software driver.
-    waits: whether the native library may wait for the device. On Metal it would wait for ever once macOS has killed a
-        command buffer (gfx-rs/wgpu#9531), so there the host polls.
     watchdog: whether the driver ends a submission that takes seconds, as on Windows and macOS (all but CPU devices).
-    mappable: whether buffers can be mapped without a staging copy (CPU devices).
     recording: the Recording in which is taken down what is done now; None where it is not.
     generation: number of buffers that pools have made: what was recorded before the last one may use a freed one.
-    max_loop_turns: number of iterations, of all loops of an invocation together, after which the driver ends it; None
-        for no limit.
     """
 
-    def __init__(self, adapter: Any, info: DeviceInfo, *, subgroups: bool = True, default_limits: bool = False) -> None:
-        self.info = info
-        features = {name for name in _WANTED_FEATURES if name in adapter.features}
-        if not subgroups:
-            features.discard("subgroup")
-        if info.kind != "cpu":
-            # Kernels are slow on memory of the host, and the host reads memory of an integrated device at a few hundred
-            # MB/s, since it is write-combined (gpu-allocator#311).
-            features.discard("mappable-primary-buffers")
-        limits = dict(_DEFAULT_LIMITS)
-        if not default_limits:
-            limits |= {name: adapter.limits[name] for name in _RAISED_LIMITS}
-        for name, needed in limits.items():
-            if adapter.limits[name] < needed:
-                raise NoAdapterError(
-                    f"the adapter {info.name!r} offers {name} = {adapter.limits[name]}, but {needed} is needed: "
-                    "choose another with --device"
-                )
+    def __init__(self, adapter: Any, info: DeviceInfo) -> None:
+        _, self.features, offered, too_small = _details(info, adapter)
+        for name, (offer, needed) in too_small.items():
+            raise NoAdapterError(
+                f"the adapter {info.name!r} offers {name} = {offer}, but {needed} is needed: "
+                "choose another with --device"
+            )
+        self.info, self.limits = info, _DEFAULT_LIMITS | {name: offered[name] for name in _RAISED_LIMITS}
         try:
-            self.wgpu_device = adapter.request_device_sync(required_features=sorted(features), required_limits=limits)
+            self.wgpu_device = adapter.request_device_sync(required_features=self.features, required_limits=self.limits)
         except RuntimeError as error:  # wgpu-py's only type for it
             reason = str(error).splitlines()[0]
             raise NoAdapterError(f"the adapter {info.name!r} cannot be opened ({reason}): choose another") from error
         self.queue = self.wgpu_device.queue
-        self.limits = limits
-        self.features = features
         self.is_cpu = info.kind == "cpu"
         self.watchdog = not self.is_cpu
-        self.waits = info.backend != "Metal"
-        self.mappable = "mappable-primary-buffers" in features
-        self.textures = self.is_cpu and limits.get("max-storage-textures-per-shader-stage", 0) >= 8
-        self.max_loop_turns = SOFTWARE_LOOP_TURNS if self.is_cpu else None
+        self.textures = self.is_cpu and self.limits["max-storage-textures-per-shader-stage"] >= 8
         self.kernel_cache: dict[Any, Any] = {}
         self.generation = 0
         self.recording: Any = None
@@ -220,11 +180,10 @@ def open_device(name: str | None = None) -> Device:
 def _open_device(name: str | None) -> Device:
     adapters = _adapters()
     if not adapters:
-        hint = INSTALL_HINT if "DX12" in _options()["backends"] else INSTALL_HINT + _WITHOUT_DXC
+        hint = _INSTALL_HINTS.get(sys.platform, "install the newest driver of your graphics card")
         raise NoAdapterError(f"no Vulkan, Metal or D3D12 adapter was found on this machine: {hint}")
-    chosen = [pair for pair in adapters if name is None or _matches(pair[0], name)]
-    if not chosen:
-        there = ", ".join(f"{info.name!r} ({info.kind})" for info, _ in adapters)
-        raise NoAdapterError(f"no adapter matches --device {name!r}; this machine has: {there}")
-    info, adapter = chosen[0]
-    return Device(adapter, info)
+    for info, adapter in adapters:
+        if name is None or _matches(info, name):
+            return Device(adapter, info)
+    there = ", ".join(f"{info.name!r} ({info.kind})" for info, _ in adapters)
+    raise NoAdapterError(f"no adapter matches --device {name!r}; this machine has: {there}")

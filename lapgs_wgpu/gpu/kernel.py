@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import re
+import weakref
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from types import TracebackType
 from typing import Any
 
 import wgpu
@@ -13,13 +13,10 @@ import wgpu
 from lapgs_wgpu.errors import DeviceMemoryError
 from lapgs_wgpu.gpu import native
 from lapgs_wgpu.gpu.array import DeviceArray
-from lapgs_wgpu.gpu.buffer import BindGroup, Buffer
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.recording import Recording
-from lapgs_wgpu.gpu.shader import Binding, Defines, ShaderError, compose, enabled, pack, reflect
-from lapgs_wgpu.gpu.wgpu_errors import TranslatedErrors, is_lost
-
-_LAYOUT_TYPE = {"uniform": "uniform", "read": "read-only-storage", "read_write": "storage"}
+from lapgs_wgpu.gpu.shader import Defines, ShaderError, compose, enabled, pack, reflect
+from lapgs_wgpu.gpu.wgpu_errors import translated_errors
 
 
 class Kernel:
@@ -30,38 +27,18 @@ class Kernel:
         self.name = name
         self.source = compose(name, defines)
         self.bindings = reflect(self.source)
-        storage = [b for b in self.bindings.values() if b.kind in ("read", "read_write")]
-        limit = device.limits["max-storage-buffers-per-shader-stage"]
-        if len(storage) > limit:
-            raise ShaderError(f"shaders/{name}.wgsl binds {len(storage)} storage buffers; the device allows {limit}")
-        wgpu_device = device.wgpu_device
         try:
-            module = wgpu_device.create_shader_module(label=name, code=self.source)
+            with translated_errors(device, "a shader"):
+                module = device.wgpu_device.create_shader_module(label=name, code=self.source)
+                self.pipeline = device.wgpu_device.create_compute_pipeline(
+                    label=name, layout="auto", compute={"module": module, "entry_point": "main"}
+                )
         except wgpu.GPUError as error:
-            if is_lost(wgpu_device):
-                with TranslatedErrors(device, "a shader"):
-                    raise
             raise ShaderError(f"shaders/{name}.wgsl does not compile:\n{error}") from error
-        entries: list[Any] = [
-            {"binding": b.number, "visibility": wgpu.ShaderStage.COMPUTE}
-            | (
-                {"storage_texture": {"access": "read-only", "format": b.type, "view_dimension": "2d"}}
-                if b.kind == "texture"
-                else {"buffer": {"type": _LAYOUT_TYPE[b.kind]}}
-            )
-            for b in self.bindings.values()
-        ]
-        self._layout = wgpu_device.create_bind_group_layout(entries=entries)
-        self.pipeline = wgpu_device.create_compute_pipeline(
-            label=name,
-            layout=wgpu_device.create_pipeline_layout(bind_group_layouts=[self._layout]),
-            compute={"module": module, "entry_point": "main"},
-        )
-        self.native = self.pipeline._internal
-        self._groups: dict[Any, BindGroup] = {}
+        self._layout = self.pipeline.get_bind_group_layout(0)
+        self._groups: dict[Any, tuple[Any, ...]] = {}
         self.textures = {name: binding.type for name, binding in self.bindings.items() if binding.kind == "texture"}
         self.written = [name for name, binding in self.bindings.items() if binding.kind == "read_write"]
-        self._kinds = {name: _scalar(binding) for name, binding in self.bindings.items()}
 
     @staticmethod
     def get(device: Device, name: str, **defines: int) -> Kernel:
@@ -79,50 +56,37 @@ class Kernel:
         """Return the bytes of one of the shader's structs, by member name."""
         return pack(self.source, struct_name, values)
 
-    def check(self, arrays: dict[str, DeviceArray]) -> None:
-        """Raise ShaderError unless names and dtypes of the arrays match the shader's bindings, and DeviceMemoryError
-        if an array is too large for a binding."""
-        if arrays.keys() != self.bindings.keys():
-            missing, unknown = self.bindings.keys() - arrays.keys(), arrays.keys() - self.bindings.keys()
-            raise ShaderError(f"shaders/{self.name}.wgsl: missing arrays {sorted(missing)}, unknown {sorted(unknown)}")
-        for name, array in arrays.items():
-            if not isinstance(array, DeviceArray):
-                raise ShaderError(f"shaders/{self.name}.wgsl: {name} must be a DeviceArray, got {type(array).__name__}")
-            declared = self._kinds[name]
-            if declared is not None and (array.dtype == "float32") != (declared == "f32"):
-                raise ShaderError(f"shaders/{self.name}.wgsl: {name} holds {declared}, got {array.dtype}")
-            if array.bound_bytes > self.device.max_binding:
-                raise DeviceMemoryError(
-                    f"{name} of the pass {self.name} needs {array.bound_bytes} bytes in one binding, "
-                    f"but {self.device.info.name} allows {self.device.max_binding}"
-                )
+    def bind(self, arrays: dict[str, DeviceArray], textures: dict[str, Any]) -> Any:
+        """Return wgpu's bind group for arrays, of which `textures` replace some.
 
-    def bind(self, arrays: dict[str, DeviceArray], textures: dict[str, Any]) -> BindGroup:
-        """Return the bind group for arrays; `textures` replace some of them. Raises as `check` does."""
+        Raises ShaderError for another dtype than the shader's, DeviceMemoryError for an array too large for a binding.
+        """
         key = tuple((name, array.key, id(textures.get(name))) for name, array in arrays.items())
-        group = self._groups.get(key)
-        if group is None:
-            self.check(arrays)
+        found = self._groups.get(key)
+        if found is None:
             entries = []
             for name, array in arrays.items():
+                self._check(name, array)
                 resource = textures.get(name, array.resource)
                 entries.append({"binding": self.bindings[name].number, "resource": resource})
             if len(self._groups) > 64:  # groups of earlier array sizes accumulate
                 self._groups.clear()
-            made = self.device.wgpu_device.create_bind_group(layout=self._layout, entries=entries)
-            group = self._groups[key] = BindGroup(made._internal, made, textures, self._groups, key)
-            for array in arrays.values():
-                array.buffer.bound.add(group)
-        return group
+            group = self.device.wgpu_device.create_bind_group(layout=self._layout, entries=entries)
+            # A group keeps device memory alive: it is dropped with the first of its buffers. The key has textures' ids.
+            buffers = [weakref.ref(array.buffer, lambda _: self._groups.pop(key, None)) for array in arrays.values()]
+            found = self._groups[key] = group, textures, buffers
+        return found[0]
 
-
-def _scalar(binding: Binding) -> str | None:
-    if binding.kind == "uniform":
-        return None
-    if binding.kind == "texture":
-        return "f32" if binding.type.endswith("float") else "u32"
-    names = re.findall(r"\w+", binding.type)
-    return names[-1] if names[-1] in ("f32", "u32", "i32") else None
+    def _check(self, name: str, array: DeviceArray) -> None:
+        binding = self.bindings[name]
+        declared = re.search(r"(f32|float)|u32|i32|uint", binding.type)
+        if binding.kind != "uniform" and declared and bool(declared[1]) != (array.dtype == "float32"):
+            raise ShaderError(f"shaders/{self.name}.wgsl: {name} holds {binding.type}, got {array.dtype}")
+        if array.bound_bytes > self.device.max_binding:
+            raise DeviceMemoryError(
+                f"{name} of the pass {self.name} needs {array.bound_bytes} bytes in one binding, "
+                f"but {self.device.info.name} allows {self.device.max_binding}"
+            )
 
 
 class Commands:
@@ -134,7 +98,6 @@ class Commands:
     def __init__(self, device: Device, *, whole: bool = False) -> None:
         self.device, self._whole = device, whole
         self._list: list[native.Command] = []
-        self._copied: list[Buffer] = []
 
     def dispatch(self, kernel: Kernel, groups: int, **arrays: DeviceArray) -> None:
         """Run `groups` workgroups, in two dimensions if there are too many for one (common/index.wgsl)."""
@@ -150,10 +113,9 @@ class Commands:
         """Run columns x rows workgroups on arrays, given by the names of the shader's bindings."""
         if min(groups) <= 0:
             return
-        if arrays.keys() != kernel.bindings.keys() or not all(
-            isinstance(array, DeviceArray) for array in arrays.values()
-        ):
-            kernel.check(arrays)
+        if arrays.keys() != kernel.bindings.keys():
+            difference = sorted(arrays.keys() ^ kernel.bindings.keys())
+            raise ShaderError(f"shaders/{kernel.name}.wgsl: arrays that only one side has: {difference}")
         textures = {name: self._texture(arrays[name], texels) for name, texels in kernel.textures.items()}
         self._list.append(("dispatch", kernel, kernel.bind(arrays, textures), *groups))
         for name in kernel.written:
@@ -162,8 +124,7 @@ class Commands:
     def _texture(self, array: DeviceArray, texel_format: str) -> Any:
         view, copies = array.buffer.texture(texel_format, array.offset, array.bound_bytes)
         if copies is not None:
-            self._copied.append(array.buffer)
-            self._list.append(("texture", copies))
+            self._list.append(("texture", copies, array.buffer))
         return view
 
     def clear(self, array: DeviceArray) -> None:
@@ -205,20 +166,22 @@ class Commands:
             self._submit()
 
     def _submit(self) -> None:
-        with TranslatedErrors(self.device, "commands"):
+        with translated_errors(self.device, "commands"):
             encoder = self.device.wgpu_device.create_command_encoder()
             with native.raising("commands"):
                 native.play(encoder, self._list)
             self.device.queue.submit([encoder.finish()])
-        self._list, self._copied = [], []
+        self._list = []
 
     def __enter__(self) -> Commands:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        if kind is None:
+    def __exit__(self, kind: object, error: BaseException | None, at: object) -> None:
+        if error is None:
             self._submit()
             return
-        for buffer in self._copied:  # the copies are never made
-            buffer.version += 1
-        TranslatedErrors(self.device, "commands").__exit__(kind, error, at)
+        for what, *values in self._list:
+            if what == "texture":  # the copies are never made
+                values[1].version += 1
+        with translated_errors(self.device, "commands"):
+            raise error

@@ -22,10 +22,8 @@ from wgpu.backends.wgpu_native._helpers import ERROR_TYPES
 from lapgs_wgpu.errors import DeviceLostError
 from lapgs_wgpu.gpu.device import Device
 
-READ, WRITE = lib.WGPUMapMode_Read, lib.WGPUMapMode_Write
-# The longest wait for a device that is polled, seconds: macOS kills work long before, and the library tells nobody.
+# The longest wait for a graphics card, seconds: macOS kills work long before, and the library tells nobody.
 LONGEST_WAIT = 60.0
-_SHORTEST_SLEEP, _LONGEST_SLEEP = 50e-6, 1e-3  # seconds between two polls
 _numbers = itertools.count(1)  # of mappings
 _statuses: dict[int, int] = {}  # of mappings that are done, by number
 
@@ -50,34 +48,37 @@ def _mapped(status: int, _message: Any, number: Any, _second: Any) -> None:
 
 
 class Mapping:
-    """The bytes of a buffer, asked for now, and there once the device has done what uses them.
+    """The bytes of a staging buffer, asked for now, and there once the device has done what uses them.
 
     `with` waits and gives them in place, until it ends. Threads may map at the same time. offset: a multiple of 8.
     nbytes: a multiple of 4. Raises wgpu.GPUError, or RuntimeError where the device refuses.
     """
 
-    def __init__(self, device: Device, buffer: Any, mode: int, offset: int, nbytes: int) -> None:
+    def __init__(self, device: Device, buffer: Any, offset: int, nbytes: int) -> None:
         self._device, self._buffer, self._place = device, buffer, (offset, nbytes)
         self._number, info = next(_numbers), ffi.new("WGPUBufferMapCallbackInfo *")  # which the library copies
         info.mode, info.callback = lib.WGPUCallbackMode_AllowProcessEvents, _mapped
         info.userdata1 = ffi.cast("void *", self._number)
         with raising("wgpuBufferMapAsync"):
-            lib.wgpuBufferMapAsync(buffer._internal, mode, offset, nbytes, info[0])
+            lib.wgpuBufferMapAsync(buffer._internal, lib.WGPUMapMode_Read, offset, nbytes, info[0])
 
-    def wait(self, *, alone: bool = False) -> None:
-        """Wait for the bytes, `alone`: not for what was submitted later. Raises DeviceLostError where none come."""
-        device, deadline, pause = self._device, time.monotonic() + LONGEST_WAIT, _SHORTEST_SLEEP
-        idle = device.waits and not alone  # the library then waits for all that was submitted
+    def wait(self) -> None:
+        """Wait for the bytes. Raises DeviceLostError where none come.
+
+        It polls, since the library would wait for all that was submitted, on Metal for ever once macOS has killed a
+        command buffer (gfx-rs/wgpu#9531).
+        """
+        device, begun = self._device, time.monotonic()
         while self._number not in _statuses:
-            lib.wgpuDevicePoll(device.wgpu_device._internal, idle, ffi.NULL)
-            if idle or self._number in _statuses:
-                continue
-            if time.monotonic() > deadline:
+            lib.wgpuDevicePoll(device.wgpu_device._internal, False, ffi.NULL)
+            if self._number in _statuses:
+                break
+            waited = time.monotonic() - begun
+            if device.watchdog and waited > LONGEST_WAIT:
                 raise DeviceLostError(
                     f"{device.info.name} has not answered for {LONGEST_WAIT:.0f} seconds: its driver has ended the work"
                 )
-            time.sleep(pause)
-            pause = min(2 * pause, _LONGEST_SLEEP)
+            time.sleep(min(1e-3, waited / 10))
 
     def __enter__(self) -> NDArray[np.uint8]:
         with raising("wgpuDevicePoll"):
@@ -93,7 +94,7 @@ class Mapping:
 
 
 # A command: ("dispatch", kernel, bind group, columns, rows), ("clear", buffer, offset, bytes), ("copy", source, offset,
-# target, offset, bytes) or ("texture", copies).
+# target, offset, bytes) or ("texture", copies, buffer).
 Command = tuple[Any, ...]
 
 
@@ -108,9 +109,9 @@ def play(encoder: Any, commands: Iterable[Command]) -> None:
             if open_pass is None:
                 open_pass, last = lib.wgpuCommandEncoderBeginComputePass(native, nothing), None
             if kernel is not last:
-                pipeline_of(open_pass, kernel.native)
+                pipeline_of(open_pass, kernel.pipeline._internal)
                 last = kernel
-            group_of(open_pass, 0, group.native, 0, nothing)
+            group_of(open_pass, 0, group._internal, 0, nothing)
             dispatch(open_pass, columns, rows, 1)
             continue
         if open_pass is not None:
@@ -134,7 +135,7 @@ class TextureCopies:
     def __init__(self, buffer: Any, offset: int, texture: Any, width: int, texel_bytes: int, texels: int) -> None:
         pitch = width * texel_bytes
         full, rest = divmod(texels, width)
-        self.parts = []
+        self.parts, self._kept = [], (buffer, texture)  # what the descriptors name lives as long
         for row, columns, rows in ((0, width, full), (full, rest, 1)):
             if columns and rows:
                 source, target = ffi.new("WGPUTexelCopyBufferInfo *"), ffi.new("WGPUTexelCopyTextureInfo *")

@@ -49,10 +49,7 @@ class RadixSort:
         passes = -(-bits // widest)
         width = -(-bits // passes) if self._lane_runs else widest
         digits = 1 << width
-        if self._lane_runs:
-            owners = runs(capacity)
-        else:
-            owners = -(-capacity // _SORT_BLOCK_ITEMS)
+        owners = runs(capacity) if self._lane_runs else -(-capacity // _SORT_BLOCK_ITEMS)
         unsummed = owners <= (FEW_RUNS if self._lane_runs else FEW_BLOCKS)
         counters = self._pool.array(f"{self._name} counters", (digits * owners,), "uint32")
         keys_out = self._pool.array(f"{self._name} keys", (capacity,), "uint32")

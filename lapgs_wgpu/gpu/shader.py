@@ -70,15 +70,12 @@ class Binding:
     type: str  # of a texture its format
 
 
+@functools.cache
 def shader_text(name: str) -> str:
     """Return the text of shaders/<name>.wgsl, or of a file elsewhere, named by its absolute path without the suffix."""
     elsewhere = Path(name + ".wgsl")
-    return elsewhere.read_text(encoding="utf-8") if elsewhere.is_absolute() else _package_text(name)
-
-
-@functools.cache
-def _package_text(name: str) -> str:
-    file = resources.files("lapgs_wgpu.shaders").joinpath(*(name + ".wgsl").split("/"))
+    inside = resources.files("lapgs_wgpu.shaders").joinpath(*(name + ".wgsl").split("/"))
+    file = elsewhere if elsewhere.is_absolute() else inside
     if not file.is_file():
         raise ShaderError(f"there is no shader file shaders/{name}.wgsl")
     return file.read_text(encoding="utf-8")
@@ -209,19 +206,15 @@ def struct_layout(source: str, struct_name: str) -> tuple[int, dict[str, tuple[i
 
     Cached, since each training step needs them.
     """
+    body = re.search(rf"struct\s+{struct_name}\s*{{(.*?)}}", source, re.S)
+    if body is None:
+        raise ShaderError(f"no struct {struct_name} in the shader")
     members: dict[str, tuple[int, str]] = {}
     size, largest = 0, 4
-    for name, kind in _members(source, struct_name):
+    for name, kind in _MEMBER.findall(re.sub(r"//[^\n]*", "", body[1])):
         alignment, length, code = _LAYOUT[kind]
         largest = max(largest, alignment)
         size += -size % alignment
         members[name] = (size, code)
         size += length
     return size + -size % max(16, largest), members  # uniform buffers come in units of 16 bytes
-
-
-def _members(source: str, struct_name: str) -> list[tuple[str, str]]:
-    body = re.search(rf"struct\s+{struct_name}\s*{{(.*?)}}", source, re.S)
-    if body is None:
-        raise ShaderError(f"no struct {struct_name} in the shader")
-    return list(_MEMBER.findall(re.sub(r"//[^\n]*", "", body[1])))

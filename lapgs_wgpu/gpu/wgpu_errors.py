@@ -8,47 +8,40 @@ checked before buffers are created.
 
 from __future__ import annotations
 
-from types import TracebackType
-from typing import Any
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import wgpu
 
 from lapgs_wgpu.errors import DeviceError, DeviceLostError, DeviceMemoryError
 from lapgs_wgpu.gpu.device import Device
 
-_NO_MEMORY = "Not enough memory left"
-_LOST = "device is lost"
 
-
-class TranslatedErrors:
-    """A context that turns exhausted memory and a lost device into a DeviceError; other errors pass unchanged.
+@contextmanager
+def translated_errors(device: Device, what: str, nbytes: int = 0) -> Iterator[None]:
+    """Turn exhausted memory and a lost device into a DeviceError; other errors pass unchanged.
 
     what: purpose of the memory. nbytes: its size, 0 if unknown.
     """
-
-    def __init__(self, device: Device, what: str, nbytes: int = 0) -> None:
-        self._device, self._what, self._nbytes = device, what, nbytes
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        if not isinstance(error, wgpu.GPUError | RuntimeError | AttributeError) or isinstance(error, DeviceError):
-            return
-        name, text = self._device.info.name, str(error)
-        if isinstance(error, wgpu.GPUOutOfMemoryError) or _NO_MEMORY in text:
-            size = f" of {self._nbytes / 1e6:.0f} MB" if self._nbytes else ""
-            raise DeviceMemoryError(
-                f"{name} has no memory left for {self._what}{size}, fewer Gaussians or smaller pictures need less"
-            ) from error
-        if _LOST in text or is_lost(self._device.wgpu_device):
-            raise DeviceLostError(f"{name} was lost, because its driver gave up or it was removed") from error
-
-
-def is_lost(native: Any) -> bool:
-    """Return whether wgpu's device is lost."""
     try:
-        native.create_buffer(size=16, usage=wgpu.BufferUsage.COPY_DST)
+        yield
+    except DeviceError:
+        raise
+    except (wgpu.GPUError, RuntimeError, AttributeError) as error:
+        if isinstance(error, wgpu.GPUOutOfMemoryError) or "Not enough memory left" in str(error):
+            size = f" of {nbytes / 1e6:.0f} MB" if nbytes else ""
+            raise DeviceMemoryError(
+                f"{device.info.name} has no memory left for {what}{size}, fewer Gaussians or smaller pictures need less"
+            ) from error
+        check_not_lost(device)
+        raise
+
+
+def check_not_lost(device: Device) -> None:
+    """Raise DeviceLostError if the device is lost."""
+    try:
+        device.wgpu_device.create_buffer(size=16, usage=wgpu.BufferUsage.COPY_DST)
     except wgpu.GPUError as error:
-        return _LOST in str(error)
-    return False
+        if "device is lost" in str(error):
+            reason = "because its driver gave up or it was removed"
+            raise DeviceLostError(f"{device.info.name} was lost, {reason}") from error

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass, replace
 
 _WATCHED = 256  # drawings of one kind, after which a plan that is too large for all of them shrinks
-_KINDS = 32  # of images, whose plans are kept
 
 
 @dataclass(frozen=True)
@@ -43,7 +42,7 @@ class BufferPlans:
         self.now = BufferPlan(capacity)
         self._first_capacity = capacity
         self._kind: Kind | None = None
-        self._others: dict[Kind, BufferPlan] = {}  # the latest last
+        self._others: dict[Kind, BufferPlan] = {}
         self._watched, self._most = 0, 0  # drawings by this plan, and the most intersections of a band
 
     def turn_to(self, kind: Kind) -> None:
@@ -54,8 +53,6 @@ class BufferPlans:
             share = math.sqrt(math.prod(kind[:2]) / math.prod(self._kind[:2]))
             guess = min(self.now.capacity, max(self._first_capacity, round(share * self.now.capacity)))
             self.now = self._others.pop(kind, BufferPlan(guess))
-            if len(self._others) > _KINDS:
-                self._others.pop(next(iter(self._others)))
             self._watched = self._most = 0
         self._kind = kind
 
@@ -77,9 +74,8 @@ class BufferPlans:
         self._watched, self._most = self._watched + 1, max(self._most, most)
         if self._watched < _WATCHED:
             return
-        capacity = self.now.capacity
-        if 2 * roomy(self._most) <= capacity:
-            capacity = roomy(self._most)
+        capacity, enough = self.now.capacity, roomy(self._most)
         # Half of the rounds may be too few; then one image is drawn twice.
-        self.now = replace(self.now, capacity=capacity, rounds=max(1, self.now.rounds // 2))
+        rounds = max(1, self.now.rounds // 2)
+        self.now = replace(self.now, capacity=enough if 2 * enough <= capacity else capacity, rounds=rounds)
         self._watched = self._most = 0

@@ -104,12 +104,16 @@ class Camera:
 
 def rotation_matrix(quaternion: NDArray[np.floating] | Sequence[float]) -> NDArray[Any]:
     """Return the rotation matrix (3, 3) of a unit quaternion (4,) wxyz; (3, 3, N) of (4, N)."""
-    w, x, y, z = quaternion
-    return np.array([
+    return np.array(rotation_rows(*quaternion))
+
+
+def rotation_rows(w: Any, x: Any, y: Any, z: Any) -> list[list[Any]]:
+    """Return the rows of the rotation matrix of a unit quaternion, whose parts are numbers, arrays or tensors."""
+    return [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
+    ]
 
 
 def intrinsics_of_fov(fov_x: float, width: int, height: int) -> NDArray[np.float64]:

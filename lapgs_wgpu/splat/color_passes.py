@@ -9,7 +9,7 @@ from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
-from lapgs_wgpu.splat.drawing import Drawing
+from lapgs_wgpu.splat.drawing import Drawing, sh_defines
 
 
 class ColorPasses:
@@ -20,7 +20,7 @@ class ColorPasses:
 
     def record(self, commands: Commands, drawing: Drawing, frame: DeviceArray, tile_counts: DeviceArray) -> None:
         """Record the colors of the splats that have a tile. tile_counts: (N,)."""
-        kernel = Kernel.get(self._device, "color", **drawing.sh_defines)
+        kernel = Kernel.get(self._device, "color", **sh_defines(drawing.gaussians.sh_degree))
         arrays = {"frame": frame, "means": drawing.gaussians.means, "tile_counts": tile_counts}
         arrays["splats"] = drawing.splats
         for part, groups, colors in self._parts(kernel, drawing.gaussians.sh):
@@ -30,7 +30,7 @@ class ColorPasses:
         self, commands: Commands, drawing: Drawing, d_splats: DeviceArray, d_means: DeviceArray, d_sh: DeviceArray
     ) -> None:
         """Record the gradients by harmonics d_sh (N, K, 3), and those by the means, which are added to d_means."""
-        kernel = Kernel.get(self._device, "color_bwd", **drawing.sh_defines)
+        kernel = Kernel.get(self._device, "color_bwd", **sh_defines(drawing.gaussians.sh_degree))
         arrays = {"frame": drawing.frames[0], "means": drawing.gaussians.means}
         arrays |= {"d_splats": d_splats, "d_means": d_means}
         both = zip(self._parts(kernel, drawing.gaussians.sh), self._parts(kernel, d_sh), strict=True)

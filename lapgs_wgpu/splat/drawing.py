@@ -33,7 +33,7 @@ class Drawing:
     """A submitted image. Its arrays are valid until the rasterizer draws another one.
 
     image: (4, H, W) red, green, blue, transmittance; with `depth` (5, H, W), the last plane is the sum of weight times
-    camera depth. splats: (N, SPLAT_FLOATS), see splat_layout. needed: (3,) uint32 per band: number of intersections;
+    camera depth. splats: (N, SPLAT_FLOATS), see constants. needed: (3,) uint32 per band: number of intersections;
     unused; whether a list needs more rounds. lists: of the band drawn last. number: counts the rasterizer's drawings.
     frames: what each band's passes share. move: records a band's frame, given that of `camera`, with the camera moved;
     None where it stands.
@@ -52,11 +52,6 @@ class Drawing:
     lists: TileLists = field(init=False)
     frames: dict[int, DeviceArray] = field(default_factory=dict)
 
-    @property
-    def sh_defines(self) -> dict[str, int]:
-        """Defines of color and color_bwd."""
-        return sh_defines(self.gaussians.sh_degree)
-
 
 def sh_defines(degree: int | None) -> dict[str, int]:
     """Return defines of color and color_bwd for harmonics of this degree, or for colors (None)."""
@@ -68,7 +63,7 @@ def sh_defines(degree: int | None) -> dict[str, int]:
 class GaussianGradients(NamedTuple):
     """Gradients with respect to the Gaussians.
 
-    splats: projected ones, (N, SPLAT_FLOATS), see splat_layout. means (N, 3), quats (N, 4), scales (N, 3). sh:
+    splats: projected ones, (N, SPLAT_FLOATS), see constants. means (N, 3), quats (N, 4), scales (N, 3). sh:
     (N, K, 3); None for Gaussians with colors, whose gradient is a column of `splats`. camera: (2, G, 4), what
     `camera_gradient` takes; None where it was not asked for.
     """

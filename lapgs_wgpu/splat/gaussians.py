@@ -35,14 +35,11 @@ class Gaussians(Generic[Array]):
         return {name: value for name, value in vars(self).items() if name != "antialiased"}
 
     def __len__(self) -> int:
-        return int(_shape(self.means)[0])
+        means: Any = self.means
+        return int(means.shape[0])
 
     @property
     def sh_degree(self) -> int | None:
         """Degree of the harmonics; None for colors."""
-        shape = _shape(self.sh)
-        return None if len(shape) == 2 else int(shape[1] ** 0.5) - 1
-
-
-def _shape(array: Any) -> tuple[int, ...]:
-    return tuple(array.shape)
+        sh: Any = self.sh
+        return None if len(sh.shape) == 2 else int(sh.shape[1] ** 0.5) - 1

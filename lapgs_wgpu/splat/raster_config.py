@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 
+from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import SOFTWARE_LOOP_TURNS, Device
-from lapgs_wgpu.gpu.probe_subgroup import subgroup_size
+from lapgs_wgpu.gpu.kernel import Commands, Kernel
 
 # Per band, on devices that limit loops: loops over the tiles of a splat take one iteration per tile, and a splat may
-# cover all. Below the `max_loop_turns` of every device, and below the workgroups of one dimension, which a counted
-# dispatch does not fold into two.
+# cover all. Below SOFTWARE_LOOP_TURNS and the workgroups of one dimension.
 MAX_BAND_TILES = 60_000
 
 # At least the turns of loops for each splat of a round. Without subgroups the backward pass sums a splat's ten values
 # in loops over the lanes: 20 turns.
 SUBGROUP_TURNS, PLAIN_TURNS = 2, 32
+
+_PROBED_LANES = 64  # probe_subgroup.wgsl: as many as the raster passes have at most
 
 
 @dataclass(frozen=True)
@@ -58,11 +61,11 @@ class RasterConfig:
         return self.tile_defines | values | flags
 
 
-def cpu_config(subgroup_size: int, max_loop_turns: int = SOFTWARE_LOOP_TURNS) -> RasterConfig:
+def cpu_config(subgroup_size: int) -> RasterConfig:
     """Return the configuration for processors: a workgroup is one vector of the processor, so that no barrier waits."""
     lanes = 16 if subgroup_size == 16 else 8
     subgroups = subgroup_size >= lanes
-    round_splats = (max_loop_turns + 1) // (SUBGROUP_TURNS if subgroups else PLAIN_TURNS)
+    round_splats = (SOFTWARE_LOOP_TURNS + 1) // (SUBGROUP_TURNS if subgroups else PLAIN_TURNS)
     return RasterConfig(8, 8, lanes, subgroups, lane_runs=True, round_splats=round_splats)
 
 
@@ -72,7 +75,19 @@ def gpu_config(subgroup_size: int) -> RasterConfig:
     return RasterConfig(16, 8, lanes, subgroups=subgroup_size >= lanes, lane_runs=False)
 
 
+@functools.cache
+def subgroup_size(device: Device) -> int:
+    """Return the lanes of a subgroup, 0 without subgroups, as a kernel measures them: adapters are unreliable there."""
+    if "subgroup" not in device.features:
+        return 0
+    sizes = DeviceArray.empty(device, "subgroup sizes", (_PROBED_LANES,), "uint32")
+    with Commands(device) as commands:
+        commands.dispatch(Kernel.get(device, "probe_subgroup"), 1, sizes=sizes)
+    found = set(sizes.read().tolist())
+    return found.pop() if len(found) == 1 else 0
+
+
 def raster_config(device: Device) -> RasterConfig:
     """Return the configuration for this adapter."""
     size = subgroup_size(device)
-    return gpu_config(size) if device.max_loop_turns is None else cpu_config(size, device.max_loop_turns)
+    return cpu_config(size) if device.is_cpu else gpu_config(size)

@@ -9,11 +9,9 @@ import torch
 from torch import Tensor
 
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.splat.constants import CONSTANTS
+from lapgs_wgpu.splat.constants import CONIC, CONSTANTS, DEPTH, MEAN, OPACITY, RADIUS
 from lapgs_wgpu.splat.rasterize import Rasterize, check_shapes
-from lapgs_wgpu.splat.splat_layout import MEAN, OPACITY, RADIUS
 
-_CONIC, _DEPTH = slice(2, 5), 9  # columns of projected Gaussians
 _MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 
 
@@ -155,7 +153,7 @@ def _meta(splats: Tensor, full: Tensor, packed: bool) -> dict[str, Any]:
     return dict(zip(("batch_ids", "camera_ids", "gaussian_ids"), ids, strict=True)) | {
         "radii": torch.stack([radii, radii], dim=-1),
         "means2d": means2d,
-        "depths": splats[..., _DEPTH].clone(),
-        "conics": splats[..., _CONIC].clone(),
+        "depths": splats[..., DEPTH].clone(),
+        "conics": splats[..., CONIC].clone(),
         "opacities": torch.where(visible, splats[..., OPACITY].exp2(), 0.0),
     }

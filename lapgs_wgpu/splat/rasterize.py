@@ -14,11 +14,10 @@ from lapgs_wgpu.gpu.array import DeviceArray, read_all
 from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.splat.constants import CONSTANTS
+from lapgs_wgpu.splat.constants import COLOR, CONSTANTS, MEAN, OPACITY, RADIUS
 from lapgs_wgpu.splat.drawing import Drawing, camera_gradient
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterizer import Rasterizer
-from lapgs_wgpu.splat.splat_layout import COLOR, MEAN, OPACITY, RADIUS
 
 
 class Rendering(NamedTuple):
@@ -83,9 +82,8 @@ def rasterize(
         ValueError: shapes do not match.
     """
     check_shapes("rasterize", means, quats, scales, opacities, colors, sh_degree)
-    if background is None:
-        background = means.new_zeros(3)
-    elif tuple(background.shape) != (3,):
+    background = means.new_zeros(3) if background is None else background
+    if tuple(background.shape) != (3,):
         raise ValueError(f"rasterize: background must have shape (3,), got {tuple(background.shape)}")
     sh = colors if sh_degree is None else colors[:, : (sh_degree + 1) ** 2]
     probe = means.new_empty((len(means), 2)).requires_grad_(torch.is_grad_enabled())
@@ -100,21 +98,15 @@ def check_shapes(
     caller: str, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, sh_degree: int | None
 ) -> None:
     """Raise ValueError, in the name of `caller`, unless the tensors have the shapes that `rasterize` lists."""
-    n = means.shape[0]
-    expected = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
-    for name, tensor in (("means", means), ("quats", quats), ("scales", scales), ("opacities", opacities)):
-        if tuple(tensor.shape) != expected[name]:
-            raise ValueError(f"{caller}: {name} must have shape {expected[name]}, got {tuple(tensor.shape)}")
-    if sh_degree is None:
-        if tuple(colors.shape) != (n, 3):
-            raise ValueError(f"{caller}: colors must have shape {(n, 3)} without sh_degree, got {tuple(colors.shape)}")
-    elif not 0 <= sh_degree <= 3:
+    if sh_degree is not None and not 0 <= sh_degree <= 3:
         raise ValueError(f"{caller}: sh_degree must be 0 to 3, got {sh_degree}")
-    elif colors.ndim != 3 or colors.shape[0] != n or colors.shape[2] != 3 or colors.shape[1] < (sh_degree + 1) ** 2:
-        raise ValueError(
-            f"{caller}: colors must have shape ({n}, K >= {(sh_degree + 1) ** 2}, 3) for sh_degree {sh_degree}, "
-            f"got {tuple(colors.shape)}"
-        )
+    n, least = len(means), None if sh_degree is None else (sh_degree + 1) ** 2
+    used = colors[:, :least] if colors.ndim == 3 else colors
+    expected = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
+    expected["colors"] = (n, 3) if least is None else (n, least, 3)
+    for (name, shape), tensor in zip(expected.items(), (means, quats, scales, opacities, used), strict=True):
+        if tuple(tensor.shape) != shape:
+            raise ValueError(f"{caller}: {name} must have shape {shape}, got {tuple(tensor.shape)}")
 
 
 class Rasterize(torch.autograd.Function):

@@ -22,10 +22,10 @@ from lapgs_wgpu.gpu.scan import Scan
 from lapgs_wgpu.splat.buffer_plan import BufferPlan, BufferPlans, roomy
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.color_passes import ColorPasses
+from lapgs_wgpu.splat.constants import SPLAT_FLOATS
 from lapgs_wgpu.splat.drawing import Drawing, GaussianGradients, TileLists
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.raster_config import MAX_BAND_TILES, RasterConfig, raster_config
-from lapgs_wgpu.splat.splat_layout import SPLAT_FLOATS
 
 _RECORD_FLOATS = 8  # rasterize_bwd.wgsl
 _DEPTH_BITS = 32

@@ -18,7 +18,7 @@ from torch import Tensor
 from lapgs_wgpu.errors import NumericalError
 from lapgs_wgpu.gpu.array import read_all
 from lapgs_wgpu.gpu.kernel import Commands
-from lapgs_wgpu.gpu.later import Ring
+from lapgs_wgpu.gpu.later import Later
 from lapgs_wgpu.motion.passes.samples import Samples
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.train.density_control import DensityControl
@@ -31,7 +31,6 @@ from lapgs_wgpu.train.resident_passes import ResidentPasses, Task
 from lapgs_wgpu.train.step_result import Measured, Scheduled, Skipped, cause, check_parameters
 
 IN_FLIGHT = 2  # steps that are submitted and not waited for
-_RING_BYTES = 8192
 _OVERFLOW = 1 << 31  # close_guard.wgsl
 
 
@@ -54,7 +53,6 @@ class ResidentStep:
         self._scene = scene = learners.scene
         self._passes = ResidentPasses(learners)
         self.parameters = self._passes.parameters
-        self._ring = Ring(scene.device, _RING_BYTES)
         self._flying: deque[Task] = deque()
         self._statistics_on_host = True
         self.settled = 0
@@ -145,7 +143,7 @@ class ResidentStep:
         task.counts = dict(self.parameters.steps)
         with Commands(self._scene.device, whole=True) as commands:
             task.drawing, told = self._passes.record(commands, task, truth)
-            task.later = self._ring.record(commands, told)
+            task.later = Later(commands, told)
         task.later.submitted()
         return task
 
