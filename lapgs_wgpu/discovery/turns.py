@@ -76,7 +76,7 @@ def find_turns(
 ) -> tuple[NDArray[np.int64], dict[int, Doubles]]:
     """(p,) which part stands for each, since several may be one thing; and by the number of each of these that turns
     its rotations (T, 3, 3) at the times (T,), from whatever orientation."""
-    centers = [tracks.paths[:, tracks.part == k].mean(axis=1) for k in range(int(tracks.part.max()) + 1)]
+    centers = [tracks.center(k) for k in range(tracks.parts)]
     radii = np.array([part_radius(tracks, k) for k in range(len(centers))])
     stands = _one_of_each(centers, radii)
     things = np.unique(stands)
@@ -90,13 +90,13 @@ def find_turns(
         if sum(len(look.places) > 0 for look in looks) < LEAST_TIMES:
             continue
         R = _smoothed(_turns(looks, clock), clock, near)
-        R = _smoothed(_fitted_again(looks, R), clock, near)
-        colors = np.concatenate([look.colors for look in looks])
-        turned, still = (
-            _explained(np.concatenate([look.places @ each for look, each in zip(looks, S, strict=True)]), colors)
-            for S in (R, [np.eye(3)] * len(R))
-        )
-        if turned - still >= GAIN * (1.0 - still):
+        known = _known(looks, R)
+        again = [_turn_of(look, each, known - _known([look], each[None])) for look, each in zip(looks, R, strict=True)]
+        R = _smoothed(np.stack(again), clock, near)
+        places, colors = (np.concatenate(each) for each in zip(*looks, strict=True))
+        still = _explained(places, colors)
+        turned = np.concatenate([look.places @ each for look, each in zip(looks, R, strict=True)])
+        if _explained(turned, colors) - still >= GAIN * (1.0 - still):
             found[k] = R
     return stands, found
 
@@ -163,8 +163,8 @@ def _looks(k: int, times: Doubles, centers: Floats, radii: Doubles, images: Sequ
 
 def _unlit(looks: list[_Look]) -> list[_Look]:
     """The colors without the light, which does not turn with a part."""
-    basis = np.stack(harmonics(*np.concatenate([look.places for look in looks]).T), axis=1)
-    bright = np.concatenate([look.colors for look in looks]).mean(axis=1)
+    places, colors = (np.concatenate(each) for each in zip(*looks, strict=True))
+    basis, bright = np.stack(harmonics(*places.T), axis=1), colors.mean(axis=1)
     H = basis.T @ basis
     light = np.linalg.solve(H + 1e-3 * (np.trace(H) + 1) / 9 * np.eye(9), basis.T @ bright)
     least = DARK * float(bright.mean()) if len(bright) else 1.0
@@ -213,19 +213,16 @@ def _turn_at(looks: list[_Look], clock: Doubles, key: int) -> tuple[Doubles, flo
             values.append(_explained(np.einsum("ni,nij->nj", places, R[of]), colors, (blocks - blocks.min())[of]))
         return np.array(values)
 
-    turns = SEARCHES[0][0] * _grid(int(FASTEST / SEARCHES[0][0]))
+    widest, far = SEARCHES[0][0], FASTEST // SEARCHES[0][0]
+    turns = widest * cubic_grid(np.arange(-far, far + 1.0))
     turns = np.radians(turns[np.linalg.norm(turns, axis=1) <= FASTEST])
     for step, reach, best in SEARCHES:
-        if step < SEARCHES[0][0]:
-            turns = np.unique((turns[:, None] + np.radians(step) * _grid(1)).reshape(-1, 3).round(9), axis=0)
+        if step < widest:
+            around = np.radians(step) * cubic_grid(np.arange(-1.0, 2.0))
+            turns = np.unique((turns[:, None] + around).reshape(-1, 3).round(9), axis=0)
         values = explained(turns, reach)
         turns = turns[np.argsort(-values, kind="stable")[:best]]
     return turns[0], float(values.max() - explained(np.zeros((1, 3)), reach)[0])
-
-
-def _grid(half: int) -> Doubles:
-    """(n, 3) whole numbers from -half to half."""
-    return cubic_grid(np.arange(-half, half + 1.0))
 
 
 def _turns(looks: list[_Look], clock: Doubles) -> Doubles:
@@ -247,14 +244,6 @@ def _turns(looks: list[_Look], clock: Doubles) -> Doubles:
             R[i] = _turn_of(looks[i], onward @ R[last[0]], known)
         known += _known([looks[i]], R[i : i + 1])
     return R
-
-
-def _fitted_again(looks: list[_Look], R: Doubles) -> Doubles:
-    """Rotations (T, 3, 3), near the given ones, of which each fits best what all other times show."""
-    known = _known(looks, R)
-    return np.stack(
-        [_turn_of(look, each, known - _known([look], each[None])) for look, each in zip(looks, R, strict=True)]
-    )
 
 
 def _known(looks: list[_Look], R: Doubles) -> Doubles:
@@ -279,7 +268,7 @@ def _turn_of(look: _Look, expected: Doubles, sums: Doubles) -> Doubles:
     variance = max(float(look.colors.var(axis=0).sum()), 1e-6)
     best = expected
     for step, half in AROUND:
-        R = Rotation.from_rotvec(np.radians(step) * _grid(half)).as_matrix() @ best
+        R = Rotation.from_rotvec(np.radians(step) * cubic_grid(np.arange(-half, half + 1.0))).as_matrix() @ best
         cells, _ = _cells(np.einsum("nj,hjk->hnk", look.places, R), FINE)
         errors = np.square(known[cells] - look.colors).sum(axis=2).mean(axis=1) / variance
         away = np.degrees(Rotation.from_matrix(R @ expected.T).magnitude())

@@ -67,7 +67,7 @@ def hull_points(dataset: Dataset, half_side: float) -> PointClouds:
         known = np.isfinite(colors).any(axis=(0, 2))
         color = np.nanmedian(colors[:, known], axis=0)  # in some cameras something else is before it
         clouds.append(Points(places[there[known]].astype(np.float32), color, np.ones(len(color), np.float32)))
-    return PointClouds(dataset.times, tuple(clouds), TINT * half_side)
+    return PointClouds(dataset.times, tuple(clouds), half_side, TINT * half_side)
 
 
 def _still_camera(views: list[View], places: NDArray[np.float32]) -> _StillCamera:
