@@ -1,7 +1,8 @@
-"""What a training starts from: what stands still, and the things that move, which a fit of it loses."""
+"""The start of a training: what stands still, and the things that move, which a fit of it loses; then a Trainer."""
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -24,12 +25,17 @@ from lapgs_wgpu.discovery.turns import find_turns
 from lapgs_wgpu.discovery.visual_hull import hull_points
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.fields.make_field import check_own
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.morton import morton_order
 from lapgs_wgpu.train.camera_refinement import Corrections
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config
+from lapgs_wgpu.train.host import step_threads, torch_threads
+from lapgs_wgpu.train.parts import Parts
+from lapgs_wgpu.train.setup import set_up
 from lapgs_wgpu.train.start import Start, start_from_points
+from lapgs_wgpu.train.trainer import Trainer
 
 DYNAMICS = 0.5  # standard deviation of the dynamics attribute of a discovered Gaussian, which it shares with its part
 SHEET_DYNAMICS = 2.0  # in place of it: of all sheets, and of the last one's time
@@ -37,6 +43,44 @@ NEARLY_ALL = 0.8  # share of the surface points that tracks explain, above which
 ALL_TURN = 0.1  # of the field's highest rates, where all that moves turns: it forgets turns sooner than places
 RAMP_STEPS = 200  # over which learning rates rise after discovery, where schedule.warm_up is 0
 SHOWN = 2.0 / 255  # least difference from the background of an image that shows something
+
+
+def start_training(
+    config: Config,
+    dataset: Dataset | None = None,
+    device: Device | None = None,
+    *,
+    parts: Parts | None = None,
+) -> Trainer:
+    """Do motion discovery as the configuration says, and make the trainer that starts from what it finds.
+
+    Discovery is left out where `discovery.enabled` is false, the field is static, or `schedule.steps` is not larger
+    than `discovery.steps`, which a note on stderr tells.
+
+    Args:
+        config: as `load_config` gives it.
+        dataset: None for the one that config.data names; a built-in scene is then written into the folder runs.
+        device: None for the default adapter.
+        parts: own field, losses, density control, learning rates and callbacks.
+
+    Returns:
+        The trainer before its first step.
+
+    Raises:
+        InputError: the configuration, the data and the parts do not fit each other, or the images show nothing.
+    """
+    parts = parts or Parts()
+    user_config, resolved, dataset, device = set_up(config, dataset, device, parts)
+    check_own(resolved.field, parts.field)
+    start, steps, needed = None, resolved.schedule.steps, resolved.discovery.steps
+    if resolved.discovery.enabled and resolved.field.kind != "static":
+        if steps > needed:
+            with torch_threads(step_threads(resolved.field, device)):
+                start = discover(resolved, dataset, device, parts.field)
+        else:
+            reason = f"schedule.steps ({steps}) must be larger than discovery.steps ({needed})"
+            print(f"note: motion discovery is left out: {reason}.", file=sys.stderr, flush=True)
+    return Trainer(user_config, dataset, device, start=start, parts=parts)
 
 
 def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Module | None = None) -> Start:

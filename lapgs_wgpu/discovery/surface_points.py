@@ -107,39 +107,39 @@ def surface_points(images: Sequence[Residual], half_side: float) -> PointClouds:
 
 def _points(image: Residual, neighbors: list[tuple[Residual, float]], always: Floats, half_side: float) -> Points:
     """neighbors: images and how many time steps they are apart. always: of `_always`."""
-    rays = image.rays(RAYS)
-    if len(rays.directions) == 0 or not neighbors:
+    directions, blurred, colors = image.rays(RAYS)
+    if len(directions) == 0 or not neighbors:
         empty = np.zeros((0, 3), np.float32)
         return Points(empty, empty, np.zeros(0, np.float32))
     eye = image.camera.position.astype(np.float32)
-    depths = _depths(eye, rays.directions, half_side)
-    places = eye + depths[..., None] * rays.directions[:, None]
-    length = np.linalg.norm(rays.directions, axis=1, keepdims=True)
+    depths = _depths(eye, directions, half_side)
+    places = eye + depths[..., None] * directions[:, None]
+    length = np.linalg.norm(directions, axis=1, keepdims=True)
     spacing = float(np.median(length[:, 0] * (depths[:, 1] - depths[:, 0])))
     votes, tolerant, weights = np.zeros((3, *depths.shape))
     of_neighbors = [1.0 / (1.0 + (lapse / SPAN) ** 2) for _, lapse in neighbors]
     for (neighbor, lapse), weight in zip(neighbors, of_neighbors, strict=True):
-        samples = neighbor.sample(places)
-        sq_distances = ((samples.colors - rays.blurred[:, None]) ** 2).sum(axis=2)
+        mask, shown, inside = neighbor.sample(places)
+        sq_distances = ((shown - blurred[:, None]) ** 2).sum(axis=2)
         agreement = 1.0 - COLOR_SHARE + COLOR_SHARE * np.exp(-sq_distances / (2 * COLOR_SPREAD**2))
-        vote = weight * samples.mask * agreement
+        vote = weight * mask * agreement
         votes += vote
         # Standard deviation of the depths at which things seem to be that move while the camera goes to the neighbor.
         parallax = float(np.linalg.norm(neighbor.camera.position - eye)) / max(float(np.linalg.norm(eye)), 1e-6)
         tolerant += _blur_along_rays(vote, MOTION * half_side * lapse / max(parallax, 1e-6) / spacing)
-        weights += weight * samples.inside
+        weights += weight * inside
     at = np.moveaxis((places / half_side + 1) * 0.5 * GRID - 0.5, -1, 0)
     share = ndimage.map_coordinates(always, at, order=1, mode="nearest")
     known = np.clip((ALWAYS - share) / ALWAYS_WIDTH, 0.0, 1.0) / np.maximum(weights, 1e-6)
     known[weights < 0.5 * sum(of_neighbors)] = 0.0  # hardly seen by others
     scores = votes * known
-    past_middle = (places * rays.directions[:, None]).sum(axis=2) / length
+    past_middle = (places * directions[:, None]).sum(axis=2) / length
     middle = _middle_of_best(tolerant * known * np.exp(-0.5 * (past_middle / (MIDDLE * half_side)) ** 2))
     low = np.floor(middle).astype(np.int64)
     depth = depths[np.arange(len(scores)), low] + (middle - low) * (depths[:, 1] - depths[:, 0])
-    positions = eye + depth[:, None] * rays.directions
+    positions = eye + depth[:, None] * directions
     best = scores.max(axis=1)
-    return Points(positions.astype(np.float32), rays.colors, best.astype(np.float32)).chosen(best > LEAST_SCORE)
+    return Points(positions.astype(np.float32), colors, best.astype(np.float32)).chosen(best > LEAST_SCORE)
 
 
 def _blur_along_rays(votes: NDArray[np.floating], spread: float) -> NDArray[np.floating]:
@@ -181,7 +181,7 @@ def _always(images: Sequence[Residual], half_side: float) -> Floats:
     places = cubic_grid(((np.arange(GRID, dtype=np.float32) + 0.5) / GRID * 2 - 1) * half_side).astype(np.float32)
     total, count = np.zeros((2, len(places)), np.float32)
     for image in images:
-        samples = image.sample(places)
-        total += samples.mask
-        count += samples.inside
+        mask, _, inside = image.sample(places)
+        total += mask
+        count += inside
     return np.divide(total, np.maximum(count, 1.0), dtype=np.float32).reshape(GRID, GRID, GRID)

@@ -99,16 +99,6 @@ def _groups(clouds: PointClouds) -> _Groups:
     return _Groups(clouds.times / time_step(clouds.times), clouds.half_side, *of_groups)
 
 
-class _Steps(NamedTuple):
-    """The steps that end in a group: the groups that they start from, their velocities and worths, and which step of
-    their start they go on from (-1: none)."""
-
-    starts: NDArray[np.int64]
-    velocities: NDArray[np.float64]
-    worths: NDArray[np.float64]
-    before: NDArray[np.int64]
-
-
 def _best_path(groups: _Groups) -> tuple[list[int], float]:
     """The groups on the path of the highest worth, in the order of time, and that worth.
 
@@ -116,7 +106,9 @@ def _best_path(groups: _Groups) -> tuple[list[int], float]:
     """
     clock, half_side = groups.clock[groups.time], groups.half_side
     first = np.searchsorted(groups.time, np.arange(len(groups.clock)))
-    steps: list[_Steps] = []
+    # Of the steps that end in each group: the groups that they start from, their velocities and worths, and which step
+    # of their start they go on from (-1: none).
+    steps: list[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]] = []
     for b, (time, center, color) in enumerate(zip(groups.time, groups.centers, groups.colors, strict=True)):
         a = np.arange(first[max(0, time - LEAP)], first[time])
         velocity = (center - groups.centers[a]) / (clock[b] - clock[a])[:, None]
@@ -126,20 +118,20 @@ def _best_path(groups: _Groups) -> tuple[list[int], float]:
         gain = groups.worth[b] - SKIPPED * (time - groups.time[a] - 1) - np.minimum(SHARP, change)
         worth, origin = groups.worth[a], np.full(len(a), -1)
         for i, group in enumerate(a):
-            earlier = steps[group]
-            bend = ((velocity[i] - earlier.velocities) ** 2).sum(axis=1) / (2 * (BEND * half_side) ** 2)
-            totals = earlier.worths - np.minimum(SHARP, bend)
+            _, velocities, worths, _ = steps[group]
+            bend = ((velocity[i] - velocities) ** 2).sum(axis=1) / (2 * (BEND * half_side) ** 2)
+            totals = worths - np.minimum(SHARP, bend)
             if totals.max(initial=-np.inf) > worth[i]:
                 worth[i], origin[i] = totals.max(), totals.argmax()
-        steps.append(_Steps(a, velocity, worth + gain, origin))
-    totals = np.array([each.worths.max(initial=0.0) for each in steps])
+        steps.append((a, velocity, worth + gain, origin))
+    totals = np.array([worths.max(initial=0.0) for _, _, worths, _ in steps])
     if not totals.any():
         return [], 0.0
     group = int(totals.argmax())
-    step = int(steps[group].worths.argmax())
-    path = [group]
+    step, path = int(steps[group][2].argmax()), [group]
     while step >= 0:
-        group, step = int(steps[group].starts[step]), int(steps[group].before[step])
+        starts, _, _, before = steps[group]
+        group, step = int(starts[step]), int(before[step])
         path.append(group)
     return path[::-1], float(totals.max())
 

@@ -147,8 +147,9 @@ def _looks(k: int, times: Doubles, centers: Floats, radii: Doubles, images: Sequ
     others = np.arange(len(radii)) != k
     for image in images:
         at = int(np.searchsorted(times, image.time))
-        rays, to = image.rays(PIXELS), centers[at] - image.camera.position
-        d = rays.directions / np.linalg.norm(rays.directions, axis=1, keepdims=True)
+        directions, _, colors = image.rays(PIXELS)
+        d = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        to = centers[at] - image.camera.position
         along = d @ to.T
         beside = (to**2).sum(axis=1) - along**2  # (n, p) squared distances of rays and centers
         hidden = (beside[:, others] < (OVERLAP * radii[others]) ** 2).any(axis=1)
@@ -157,7 +158,7 @@ def _looks(k: int, times: Doubles, centers: Floats, radii: Doubles, images: Sequ
             continue
         chosen = chosen[evenly_indices(len(chosen), SAMPLES)]
         distances = along[chosen, k] - np.sqrt(radii[k] ** 2 - np.maximum(beside[chosen, k], 0.0))
-        found[at].append(_Look((distances[:, None] * d[chosen] - to[k]) / radii[k], rays.colors[chosen]))
+        found[at].append(_Look((distances[:, None] * d[chosen] - to[k]) / radii[k], colors[chosen]))
     return _unlit([_Look(*map(np.concatenate, zip(*each, strict=True))) for each in found])
 
 
