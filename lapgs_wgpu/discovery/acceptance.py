@@ -31,7 +31,7 @@ NEAR = 0.1  # box half sides; distance within which a track explains a surface p
 
 
 def rows_with(static: Scene4D, tracks: Tracks, *, sheets: bool = False) -> dict[str, Tensor]:
-    """The Gaussians of the static fit, then one for each track at its place at the key time, in host memory.
+    """The Gaussians of the static fit, then one for each track at its place at the key time.
 
     sheets: whether each part is a sheet of its own, which nothing lies behind. They are the parameters of a scene
     without a field, float32.
@@ -43,7 +43,7 @@ def rows_with(static: Scene4D, tracks: Tracks, *, sheets: bool = False) -> dict[
     else:
         scales = SCALE * initial_scales(tracks.positions)
     new = isotropic_rows(tracks.positions, tracks.colors, scales, SHEET_OPACITY if sheets else OPACITY)
-    return {name: torch.cat([static.parameters[name].detach().cpu(), values]) for name, values in new.items()}
+    return {name: torch.cat([static.parameters[name].detach(), values]) for name, values in new.items()}
 
 
 def tracks_in_images(

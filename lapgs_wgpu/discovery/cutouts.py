@@ -86,39 +86,38 @@ def cutout_tracks(
     parts = [_placed(cutout, residuals, ground, POINTS // len(cutouts)) for cutout in cutouts]
     number = np.repeat(np.arange(len(parts)), [len(colors) for _, colors in parts])
     paths = np.concatenate([paths for paths, _ in parts], axis=1)
-    way = _common_way(paths, _seen(cutouts, number))
-    for k, cutout in enumerate(cutouts):  # beyond, it goes as all go
-        first, last = np.flatnonzero(cutout.seen)[[0, -1]]
+    seen = np.stack([cutout.seen for cutout in cutouts], axis=1)
+    way = _common_way(paths, seen[:, number])
+    for k in range(len(cutouts)):  # beyond, it goes as all go
+        first, last = np.flatnonzero(seen[:, k])[[0, -1]]
         own = number == k
         paths[:first, own] = paths[first, own] + (way[:first] - way[first])[:, None]
         paths[last + 1 :, own] = paths[last, own] + (way[last + 1 :] - way[last])[:, None]
-    _show_nearest(cutouts)
+    _show_nearest(cutouts, seen)
     keys = np.array([cutout.key for cutout in cutouts])
     ahead = np.mean([each.camera.T_cam_world[2, :3] for each in residuals], axis=0).astype(np.float32)
     apart = np.linspace(*APART, len(parts), dtype=np.float32)[np.argsort(np.argsort(keys))]
     positions = (paths - way[:, None])[keys[number], np.arange(len(number))]
     positions += half_side * apart[number][:, None] * ahead - positions.mean(axis=0)
-    tracks = Tracks(positions, np.concatenate([colors for _, colors in parts]), number, paths, _seen(cutouts, number))
+    tracks = Tracks(positions, np.concatenate([colors for _, colors in parts]), number, paths, seen[:, number])
     return tracks, float((known & masks).sum() / masks.sum())
 
 
-def _seen(cutouts: Sequence[_Cutout], number: NDArray[np.int64]) -> Mask:
-    """(T, n) whether the cut-outs of these numbers (n,) are seen."""
-    return np.stack([cutout.seen for cutout in cutouts], axis=1)[:, number]
+def _show_nearest(cutouts: Sequence[_Cutout], seen: Mask) -> None:
+    """Have each image show the cut-outs of the nearest images: what a nearer one explains is not shown twice.
 
-
-def _show_nearest(cutouts: Sequence[_Cutout]) -> None:
-    """Have each image show the cut-outs of the nearest images: what a nearer one explains is not shown twice."""
-    for t in range(len(cutouts[0].seen)):
+    seen: (T, cut-outs), which becomes False where they are not shown.
+    """
+    for t in range(len(seen)):
         known = np.zeros_like(cutouts[0].explained[t])
-        for cutout in sorted(cutouts, key=lambda each: abs(each.key - t)):
-            own = cutout.explained[t]
-            cutout.seen[t] &= bool((own & ~known).sum() > NEWS * own.sum())
-            if cutout.seen[t]:
+        for k in np.argsort([abs(cutout.key - t) for cutout in cutouts], kind="stable"):
+            own = cutouts[k].explained[t]
+            seen[t, k] &= (own & ~known).sum() > NEWS * own.sum()
+            if seen[t, k]:
                 known |= own
-    for cutout in cutouts:  # without a break
-        runs = ndimage.label(cutout.seen)[0]
-        cutout.seen[:] = runs == runs[cutout.key]
+    for k, cutout in enumerate(cutouts):  # without a break
+        runs = ndimage.label(seen[:, k])[0]
+        seen[:, k] = runs == runs[cutout.key]
 
 
 def _common_way(paths: Floats, seen: Mask) -> Floats:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import nn
+from torch import Tensor, nn
 
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.discovery.acceptance import explained_share, rows_with, tracks_in_images
@@ -209,10 +209,9 @@ def scene_with(
     sheets: bool,
 ) -> Scene4D:
     """The Gaussians of what stands still, then one for each track; the field does not move them yet."""
+    rows: dict[str, Tensor] = dict(static.parameters)
     dynamics = torch.zeros(len(static), config.field.dynamics_size)
-    if tracks is None:
-        rows = {name: values.detach().cpu() for name, values in static.parameters.items()}
-    else:
+    if tracks is not None:
         rows = rows_with(static, tracks, sheets=sheets)
         of_part = DYNAMICS * torch.randn(tracks.parts, config.field.dynamics_size, generator=generator)
         if sheets and config.field.dynamics_size > 1:  # shown one after another, which the field can tell by these
@@ -220,9 +219,8 @@ def scene_with(
             middle = np.array([np.average(np.linspace(-1, 1, len(each)), weights=each) for each in when])
             of_part[:, :2] = torch.from_numpy(np.stack([np.ones_like(middle), middle], axis=1)) * SHEET_DYNAMICS
         dynamics = torch.cat([dynamics, of_part[torch.from_numpy(tracks.part)]])
-    rows["dynamics"] = dynamics
     return Scene4D(
-        rows,
+        rows | {"dynamics": dynamics},
         config.field,
         static.device,
         sh_degree=static.sh_degree,

@@ -42,6 +42,7 @@ FASTEST = 36.0  # degrees a time step
 # and how many turns the next one looks around.
 SEARCHES = (8.0, 3, 12), (4.0, 5, 4), (2.0, 8, 1)
 CELL, FINE = 0.18, 0.12  # radii; size of the places at which colors are compared, in the search and from there on
+SIDE = int(2 / FINE) + 3  # of these along an axis
 BLUR = 1.0  # FINE; standard deviation of the weights by which the colors around a place tell its color
 KEPT = 5  # time steps from the key time, up to which its turn is kept
 AROUND = (6.0, 2), (2.0, 2), (1.0, 1)  # degrees of a step and number of steps, of the search for the turn of a time
@@ -175,11 +176,10 @@ def _unlit(looks: list[_Look]) -> list[_Look]:
     ]
 
 
-def _cells(places: Doubles, size: float) -> tuple[NDArray[np.int64], int]:
-    """(...) numbers of the cells of a cubic grid in which places (..., 3) lie, and how many it has along an axis."""
-    side = int(2 / size) + 3
-    index = np.floor(places / size).astype(np.int64) + side // 2
-    return (index[..., 0] * side + index[..., 1]) * side + index[..., 2], side
+def _cells(places: Doubles, size: float) -> NDArray[np.int64]:
+    """(...) numbers of the cells of this size, of a cubic grid of SIDE^3, in which places (..., 3) lie."""
+    index = np.floor(places / size).astype(np.int64) + SIDE // 2
+    return (index[..., 0] * SIDE + index[..., 1]) * SIDE + index[..., 2]
 
 
 def _explained(places: Doubles, colors: Floats, blocks: NDArray[np.int64] | int = 0) -> float:
@@ -187,8 +187,7 @@ def _explained(places: Doubles, colors: Floats, blocks: NDArray[np.int64] | int 
     blocks: (n,) from 0; only places of one block are compared."""
     if len(colors) < 2:
         return 0.0
-    cells, side = _cells(places, CELL)
-    cells += blocks * side**3
+    cells = _cells(places, CELL) + blocks * SIDE**3
     counts = np.bincount(cells)
     used = np.flatnonzero(counts)
     rest = float(np.square(colors).sum())
@@ -248,11 +247,11 @@ def _turns(looks: list[_Look], clock: Doubles) -> Doubles:
 
 
 def _known(looks: list[_Look], R: Doubles) -> Doubles:
-    """(4, n, n, n) what times of rotations R (T, 3, 3) show of a ball's places of size FINE: number of samples, and
-    sums of their colors."""
-    sums = np.zeros((4, *[_cells(np.zeros(3), FINE)[1]] * 3))
+    """(4, SIDE, SIDE, SIDE) number of samples, and sums of their colors, that times of rotations R (T, 3, 3) show of a
+    ball's places of size FINE."""
+    sums = np.zeros((4, SIDE, SIDE, SIDE))
     for look, turn in zip(looks, R, strict=True):
-        cells, _ = _cells(look.places @ turn, FINE)
+        cells = _cells(look.places @ turn, FINE)
         for each, values in zip(sums, [None, *look.colors.T], strict=True):
             each += np.bincount(cells, values, each.size).reshape(each.shape)
     return sums
@@ -270,7 +269,7 @@ def _turn_of(look: _Look, expected: Doubles, sums: Doubles) -> Doubles:
     best = expected
     for step, half in AROUND:
         R = Rotation.from_rotvec(np.radians(step) * cubic_grid(np.arange(-half, half + 1.0))).as_matrix() @ best
-        cells, _ = _cells(np.einsum("nj,hjk->hnk", look.places, R), FINE)
+        cells = _cells(np.einsum("nj,hjk->hnk", look.places, R), FINE)
         errors = np.square(known[cells] - look.colors).sum(axis=2).mean(axis=1) / variance
         away = np.degrees(Rotation.from_matrix(R @ expected.T).magnitude())
         best = R[int((errors + (away / AS_BEFORE) ** 2).argmin())]
