@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from lapgs_wgpu.data.load import load_dataset
-    from lapgs_wgpu.discovery.start_training import start_training
+    from lapgs_wgpu.discovery.discover import start_training
     from lapgs_wgpu.gpu.device import list_devices, open_device
     from lapgs_wgpu.motion.fields.deformation import Deformation
     from lapgs_wgpu.motion.scene import Scene4D, load
@@ -39,7 +39,7 @@ _HOMES = {
     "open_device": "gpu.device",
     "load_config": "train.presets",
     "load_dataset": "data.load",
-    "start_training": "discovery.start_training",
+    "start_training": "discovery.discover",
     "Trainer": "train.trainer",
     "StepResult": "train.step_result",
     "Parts": "train.parts",

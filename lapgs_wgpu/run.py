@@ -14,7 +14,7 @@ from typing import Any
 from lapgs_wgpu.data.initial_gaussians import first_points
 from lapgs_wgpu.data.validation import check_in_view, check_spacing, check_times
 from lapgs_wgpu.data.views import Dataset, spread_views
-from lapgs_wgpu.discovery.start_training import start_training
+from lapgs_wgpu.discovery.discover import start_training
 from lapgs_wgpu.errors import DeviceError, InputError, NumericalError, quoted
 from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.folder_lock import locked_folder

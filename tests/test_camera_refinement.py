@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from view_alignment import aligned_view
 
 from lapgs_wgpu.data import Dataset
-from lapgs_wgpu.discovery.start_training import start_training
+from lapgs_wgpu.discovery.discover import start_training
 from lapgs_wgpu.discovery.static_fit import static_config
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device

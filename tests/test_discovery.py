@@ -18,12 +18,11 @@ from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.data.views import small_views
 from lapgs_wgpu.discovery import rigid_fit
 from lapgs_wgpu.discovery.acceptance import rows_with, tracks_in_images
-from lapgs_wgpu.discovery.discover import RAMP_STEPS, discover
+from lapgs_wgpu.discovery.discover import RAMP_STEPS, discover, start_training
 from lapgs_wgpu.discovery.field_fit import fit_field
 from lapgs_wgpu.discovery.residual import Residual
-from lapgs_wgpu.discovery.start_training import start_training
 from lapgs_wgpu.discovery.static_fit import static_config, static_fit
-from lapgs_wgpu.discovery.surface_points import PointClouds, Points, parts_of, surface_points
+from lapgs_wgpu.discovery.surface_points import PointClouds, Points, surface_points
 from lapgs_wgpu.discovery.tracks import Tracks, find_tracks
 from lapgs_wgpu.discovery.trajectories import find_trajectories
 from lapgs_wgpu.discovery.turns import find_turns
@@ -106,7 +105,7 @@ def test_samples_beside_an_image_and_behind_a_camera_are_outside(residuals: list
     camera = residuals[0].camera
     ahead = camera.T_cam_world[2, :3]
     points = np.stack([camera.position + 3 * ahead, camera.position - 3 * ahead, camera.position + 0.5 * ahead + 9])
-    assert residuals[0].sample(points.astype(np.float32)).inside.tolist() == [True, False, False]
+    assert residuals[0].sample(points.astype(np.float32))[2].tolist() == [True, False, False]
 
 
 # Surface points ------------------------------------------------------------------------------------------------------
@@ -140,13 +139,14 @@ def test_images_without_motion_have_no_points(residuals: list[Residual]) -> None
     empty = [Residual(r.camera, r.time, r.image, r.image) for r in residuals]
     clouds = surface_points(empty, BOX)
     assert clouds.total == 0
-    assert find_tracks(clouds, BOX) is None
+    assert find_tracks(clouds) is None
 
 
 def test_colors_part_what_touches() -> None:
-    points = balls(np.zeros((1, 3)), np.array([[RADIUS, 0, 0]])).clouds[0]
-    assert not parts_of(points, LINK, 0.0).any()
-    part, red = parts_of(points, LINK, BOX), points.colors[:, 0] > 0.5
+    clouds = balls(np.zeros((1, 3)), np.array([[RADIUS, 0, 0]]))
+    points = clouds.clouds[0]
+    assert not clouds.parts(points).any()
+    part, red = clouds._replace(tint=BOX).parts(points), points.colors[:, 0] > 0.5
     assert not set(part[red]) & set(part[~red])
 
 
@@ -170,7 +170,7 @@ def balls(*centers: np.ndarray, gone: range = range(0)) -> PointClouds:
         positions, of_color = (np.concatenate(values).astype(np.float32) for values in zip(*parts, strict=True))
         count = 0 if i in gone else len(positions)
         clouds.append(Points(positions[:count], of_color[:count], np.full(count, 0.9, np.float32)))
-    return PointClouds(times, tuple(clouds))
+    return PointClouds(times, tuple(clouds), BOX)
 
 
 def errors(tracks: Tracks, center: np.ndarray) -> np.ndarray:
@@ -182,9 +182,6 @@ def errors(tracks: Tracks, center: np.ndarray) -> np.ndarray:
     return np.min(every, axis=0) / RADIUS
 
 
-LINK = 0.14
-
-
 def fast_path(t: np.ndarray) -> np.ndarray:
     """(T, 3): five turns on the circle; at 100 times, 1.3 radii of the ball from one time to the next."""
     return path(np.mod(5 * t, 1.0))
@@ -193,7 +190,7 @@ def fast_path(t: np.ndarray) -> np.ndarray:
 def test_trajectories_follow_what_passes_its_own_radius_from_one_time_to_the_next() -> None:
     t = np.linspace(0, 1, 100)
     one, other = fast_path(t), np.stack([0.8 * np.cos(10 * np.pi * t), 0 * t, -0.7 + 0 * t], axis=1)
-    found = find_trajectories(balls(one, other), LINK, BOX)[0]
+    found = find_trajectories(balls(one, other))[0]
     assert len(found) == 2
     for center in (one, other):
         apart = min((np.linalg.norm(each.centers - center, axis=1) for each in found), key=np.median)
@@ -203,7 +200,7 @@ def test_trajectories_follow_what_passes_its_own_radius_from_one_time_to_the_nex
 
 def test_a_trajectory_leaps_over_times_without_points() -> None:
     center = fast_path(np.linspace(0, 1, 120))  # a fifth of a turn
-    ((found,),) = find_trajectories(balls(center, gone=range(50, 54)), LINK, BOX)
+    ((found,),) = find_trajectories(balls(center, gone=range(50, 54)))
     assert not found.seen[50:54].any()
     assert found.seen[:50].mean() > 0.9
     assert found.seen[54:].mean() > 0.9
@@ -213,7 +210,7 @@ def test_a_trajectory_leaps_over_times_without_points() -> None:
 def test_a_trajectory_does_not_change_over_to_another_color_at_a_crossing() -> None:
     t = np.linspace(-1, 1, 60)
     one, other = np.stack([0.9 * t, 0.25 + 0 * t, 0 * t], axis=1), np.stack([0 * t, 0.9 * t - 0.3, 0 * t], axis=1)
-    found = find_trajectories(balls(one, other), LINK, BOX)[0]
+    found = find_trajectories(balls(one, other))[0]
     for center in (one, other):
         assert min(np.linalg.norm(each.centers - center, axis=1)[[0, 10, 50, 59]].max() for each in found) < RADIUS
 
@@ -233,7 +230,7 @@ def test_equal_things_keep_their_own_trajectories_through_gaps_between_the_image
 
 def keep_their_own(one: np.ndarray, other: np.ndarray, times: np.ndarray) -> None:
     grey = tuple(cloud._replace(colors=0 * cloud.colors + 0.5) for cloud in balls(one, other).clouds)
-    found = find_trajectories(PointClouds(times, grey), LINK, BOX)[0]
+    found = find_trajectories(PointClouds(times, grey, BOX))[0]
     assert len(found) == 2
     for center in (one, other):
         assert min(np.linalg.norm(each.centers - center, axis=1).max() for each in found) < 1.5 * RADIUS
@@ -244,7 +241,7 @@ def test_patches_that_come_and_go_are_not_followed() -> None:
     rng = np.random.default_rng(3)
     places = rng.uniform(-0.8, 0.8, (6, 3))
     leaping = places[rng.integers(0, 6, 80)]
-    assert find_tracks(balls(leaping), BOX) is None
+    assert find_tracks(balls(leaping)) is None
 
 
 # Turns ---------------------------------------------------------------------------------------------------------------
@@ -389,7 +386,7 @@ def test_every_field_learns_tracks(device: Device, kind: str) -> None:
     at_rest = np.linalg.norm(tracks.paths - tracks.positions, axis=2).mean()
     times, generator = np.linspace(0, 1, 20), torch.Generator().manual_seed(0)
     light = np.linspace(0.5, 1.5, 20, dtype=np.float32)[:, None].repeat(20, axis=1)
-    error = fit_field(scene, tracks, times, 0, 250, generator, lambda step: None, light={0: light})
+    error = fit_field(scene, tracks, times, 250, generator, lambda step: None, fades=False, light={0: light})
     assert error < {"laplacian": 0.35, "grid4d": 0.35, "hexplane": 0.65, "mlp": 0.65}[kind] * at_rest
     brighter = float((scene.at(1.0).sh - scene.at(0.0).sh).detach()[:, 0].mean())
     assert (brighter > 1e-3) == (kind == "laplacian")  # the only one whose colors change

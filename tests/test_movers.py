@@ -16,8 +16,8 @@ from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.placement import mover_cube
 from lapgs_wgpu.data.views import composite, small_views
 from lapgs_wgpu.discovery.cutouts import cutout_tracks
+from lapgs_wgpu.discovery.discover import start_training
 from lapgs_wgpu.discovery.residual import Residual
-from lapgs_wgpu.discovery.start_training import start_training
 from lapgs_wgpu.discovery.static_fit import static_fit
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device

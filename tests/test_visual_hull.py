@@ -52,6 +52,6 @@ def test_a_ball_is_found_and_followed() -> None:
         assert np.linalg.norm(cloud.positions - center(time), axis=1).max() < 1.5 * RADIUS
         assert len(cloud.scores) > 0.9 * POINTS  # fewer than its cells
         assert np.quantile(np.abs(cloud.colors - COLOR), 0.8) < 0.01  # the rim may be gray
-    tracks = find_tracks(clouds, HALF)
+    tracks = find_tracks(clouds)
     assert tracks is not None
     assert np.abs(tracks.paths.mean(axis=1) - [center(time) for time in TIMES]).max() < 0.3 * RADIUS

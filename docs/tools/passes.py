@@ -204,7 +204,7 @@ def discovery(scenes: Path) -> Picture:
     static, images = fit.scene, fit.images
     meter.clear()
     clouds = surface_points(images, config.points.box)
-    found = find_tracks(clouds, config.points.box)
+    found = find_tracks(clouds)
     tracks = None if found is None else tracks_in_images(found, clouds.times, images, static, 0.0, together=False)
     if tracks is None:
         raise SystemExit("discovery has found no moving parts in the built-in scene")

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from lapgs_wgpu.data.evenly import evenly
@@ -32,7 +31,7 @@ NEAR = 0.1  # box half sides; distance within which a track explains a surface p
 
 
 def rows_with(static: Scene4D, tracks: Tracks, *, sheets: bool = False) -> dict[str, Tensor]:
-    """The Gaussians of the static fit, then one for each track at its place at the key time, in host memory.
+    """The Gaussians of the static fit, then one for each track at its place at the key time.
 
     sheets: whether each part is a sheet of its own, which nothing lies behind. They are the parameters of a scene
     without a field, float32.
@@ -44,7 +43,7 @@ def rows_with(static: Scene4D, tracks: Tracks, *, sheets: bool = False) -> dict[
     else:
         scales = SCALE * initial_scales(tracks.positions)
     new = isotropic_rows(tracks.positions, tracks.colors, scales, SHEET_OPACITY if sheets else OPACITY)
-    return {name: torch.cat([static.parameters[name].detach().cpu(), values]) for name, values in new.items()}
+    return {name: torch.cat([static.parameters[name].detach(), values]) for name, values in new.items()}
 
 
 def tracks_in_images(
@@ -63,11 +62,9 @@ def tracks_in_images(
     kept, too.
     """
     judges = evenly(images, IMAGES)
-    kept = np.zeros(int(tracks.part.max()) + 1, bool)
+    kept = np.zeros(tracks.parts, bool)
     for k in range(len(kept)):
-        part = tracks.of_parts(np.arange(len(kept)) == k)
-        assert part is not None
-        moving, gain = _shares(part, times, judges, static, background)
+        moving, gain = _shares(tracks.rows(tracks.part == k), times, judges, static, background)
         kept[k] = moving >= MOVING or (together and gain >= GAIN)
     return tracks.of_parts(kept)
 
@@ -98,9 +95,9 @@ def _shares(
     return moving / max(pixels, 1), 1.0 - after / max(before, 1e-6)
 
 
-def explained_share(clouds: PointClouds, tracks: Tracks, half_side: float) -> float:
+def explained_share(clouds: PointClouds, tracks: Tracks | None) -> float:
     """Of the surface points, those that lie on a track."""
-    near = 0
-    for cloud, path in zip(clouds.clouds, tracks.paths, strict=True):
-        near += int((cKDTree(path).query(cloud.positions)[0] < NEAR * half_side).sum())
+    if tracks is None:
+        return 0.0
+    near = sum(int((distances < NEAR * clouds.half_side).sum()) for distances, _ in clouds.nearest(tracks.paths))
     return near / max(clouds.total, 1)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from lapgs_wgpu.data.cloud import points_at
 from lapgs_wgpu.data.evenly import evenly_indices
 from lapgs_wgpu.discovery.residual import Floats, Mask, Residual
 from lapgs_wgpu.discovery.tracks import Tracks
@@ -37,13 +38,6 @@ APART = -0.5, 0.5  # half sides of the box: how far the first and the last cut-o
 FAR_BELOW = 3  # pixels; the ground that a foot stands on lies so far below
 
 Map = NDArray[np.float64]
-
-
-class _Image(NamedTuple):
-    """levels: for each of BLURS (H, W, 12): colors and mask, and their slopes along x and along y."""
-
-    residual: Residual
-    levels: list[Floats]
 
 
 class _Cutout(NamedTuple):
@@ -69,8 +63,8 @@ def cutout_tracks(
     residuals: images in the order of their times, whose masks say what moves. depths: (H, W) of what stands still in
     each, world units, NaN where unknown. half_side: of the box that the field covers, world units.
     """
-    images = [_Image(each, _levels(each)) for each in residuals]
-    masks = np.stack([image.residual.mask for image in images])
+    levels = [_levels(each) for each in residuals]
+    masks = np.stack([each.mask for each in residuals])
     known, least = np.zeros_like(masks), LEAST * masks[0].size
     cutouts: list[_Cutout] = []
     rest = masks.sum(axis=(1, 2))
@@ -82,49 +76,48 @@ def cutout_tracks(
             part = labels == label
             if (part & ~known[key]).sum() > max(ENOUGH * part.sum(), least):
                 rows, columns = np.nonzero(part)
-                cutouts.append(_followed(images, key, np.stack([columns, rows], axis=1)))
+                cutouts.append(_followed(levels, masks, key, np.stack([columns, rows], axis=1)))
                 known |= cutouts[-1].explained
         enough[key] = np.inf
         rest = np.where(np.isinf(enough), 0, (masks & ~known).sum(axis=(1, 2)))
     if not cutouts:
         return None, 0.0
-    ground = [_depths(image.residual.mask, depth) for image, depth in zip(images, depths, strict=True)]
-    parts = [_placed(cutout, images, ground, POINTS // len(cutouts)) for cutout in cutouts]
+    ground = [_depths(mask, depth) for mask, depth in zip(masks, depths, strict=True)]
+    parts = [_placed(cutout, residuals, ground, POINTS // len(cutouts)) for cutout in cutouts]
     number = np.repeat(np.arange(len(parts)), [len(colors) for _, colors in parts])
     paths = np.concatenate([paths for paths, _ in parts], axis=1)
-    way = _common_way(paths, _seen(cutouts, number))
-    for k, cutout in enumerate(cutouts):  # beyond, it goes as all go
-        first, last = np.flatnonzero(cutout.seen)[[0, -1]]
+    seen = np.stack([cutout.seen for cutout in cutouts], axis=1)
+    way = _common_way(paths, seen[:, number])
+    for k in range(len(cutouts)):  # beyond, it goes as all go
+        first, last = np.flatnonzero(seen[:, k])[[0, -1]]
         own = number == k
         paths[:first, own] = paths[first, own] + (way[:first] - way[first])[:, None]
         paths[last + 1 :, own] = paths[last, own] + (way[last + 1 :] - way[last])[:, None]
-    _show_nearest(cutouts)
+    _show_nearest(cutouts, seen)
     keys = np.array([cutout.key for cutout in cutouts])
     ahead = np.mean([each.camera.T_cam_world[2, :3] for each in residuals], axis=0).astype(np.float32)
     apart = np.linspace(*APART, len(parts), dtype=np.float32)[np.argsort(np.argsort(keys))]
     positions = (paths - way[:, None])[keys[number], np.arange(len(number))]
     positions += half_side * apart[number][:, None] * ahead - positions.mean(axis=0)
-    tracks = Tracks(positions, np.concatenate([colors for _, colors in parts]), number, paths, _seen(cutouts, number))
+    tracks = Tracks(positions, np.concatenate([colors for _, colors in parts]), number, paths, seen[:, number])
     return tracks, float((known & masks).sum() / masks.sum())
 
 
-def _seen(cutouts: Sequence[_Cutout], number: NDArray[np.int64]) -> Mask:
-    """(T, n) whether the cut-outs of these numbers (n,) are seen."""
-    return np.stack([cutout.seen for cutout in cutouts], axis=1)[:, number]
+def _show_nearest(cutouts: Sequence[_Cutout], seen: Mask) -> None:
+    """Have each image show the cut-outs of the nearest images: what a nearer one explains is not shown twice.
 
-
-def _show_nearest(cutouts: Sequence[_Cutout]) -> None:
-    """Have each image show the cut-outs of the nearest images: what a nearer one explains is not shown twice."""
-    for t in range(len(cutouts[0].seen)):
+    seen: (T, cut-outs), which becomes False where they are not shown.
+    """
+    for t in range(len(seen)):
         known = np.zeros_like(cutouts[0].explained[t])
-        for cutout in sorted(cutouts, key=lambda each: abs(each.key - t)):
-            own = cutout.explained[t]
-            cutout.seen[t] &= bool((own & ~known).sum() > NEWS * own.sum())
-            if cutout.seen[t]:
+        for k in np.argsort([abs(cutout.key - t) for cutout in cutouts], kind="stable"):
+            own = cutouts[k].explained[t]
+            seen[t, k] &= (own & ~known).sum() > NEWS * own.sum()
+            if seen[t, k]:
                 known |= own
-    for cutout in cutouts:  # without a break
-        runs = ndimage.label(cutout.seen)[0]
-        cutout.seen[:] = runs == runs[cutout.key]
+    for k, cutout in enumerate(cutouts):  # without a break
+        runs = ndimage.label(seen[:, k])[0]
+        seen[:, k] = runs == runs[cutout.key]
 
 
 def _common_way(paths: Floats, seen: Mask) -> Floats:
@@ -138,6 +131,7 @@ def _common_way(paths: Floats, seen: Mask) -> Floats:
 
 
 def _levels(residual: Residual) -> list[Floats]:
+    """For each of BLURS (H, W, 12): colors and mask, and their slopes along x and along y."""
     planes = np.concatenate([residual.image, residual.mask[..., None]], axis=2).astype(np.float32)
     levels = []
     for blur in BLURS:
@@ -147,27 +141,27 @@ def _levels(residual: Residual) -> list[Floats]:
     return levels
 
 
-def _followed(images: Sequence[_Image], key: int, pixels: NDArray[np.int64]) -> _Cutout:
+def _followed(levels: Sequence[list[Floats]], masks: Mask, key: int, pixels: NDArray[np.int64]) -> _Cutout:
     """Follow a cut-out to both ends of the clip."""
-    maps, seen = np.tile(np.eye(2, 3), (len(images), 1, 1)), np.zeros(len(images), bool)
-    explained = np.zeros((len(images), *images[0].residual.mask.shape), bool)
+    maps, seen = np.tile(np.eye(2, 3), (len(masks), 1, 1)), np.zeros(len(masks), bool)
+    explained = np.zeros_like(masks)
     seen[key] = explained[key, pixels[:, 1], pixels[:, 0]] = True
     for way in (-1, 1):
         before, step = np.eye(2, 3), np.zeros((2, 3))
-        for at in range(key + way, len(images) if way > 0 else -1, way):
+        for at in range(key + way, len(masks) if way > 0 else -1, way):
             found, alike = max(
-                (_registered(images[key], images[at], pixels, start) for start in (before + step, before)),
+                (_registered(levels[key], levels[at], pixels, start) for start in (before + step, before)),
                 key=lambda each: each[1],
             )
             if alike < LOST:
                 break
             maps[at], seen[at] = found, True
             step, before = found - before, found
-            explained[at] = _explained(images[key], images[at], pixels, found)
+            explained[at] = _explained(levels[key], levels[at], masks[at], pixels, found)
     return _Cutout(key, pixels, maps, seen, explained)
 
 
-def _registered(source: _Image, target: _Image, pixels: NDArray[np.int64], start: Map) -> tuple[Map, float]:
+def _registered(source: list[Floats], target: list[Floats], pixels: NDArray[np.int64], start: Map) -> tuple[Map, float]:
     """The map (2, 3) of a cut-out's pixels to another image, and the share of them that look alike there."""
     chosen = pixels[evenly_indices(len(pixels), PIXELS)]
     x, y = chosen.T
@@ -175,10 +169,9 @@ def _registered(source: _Image, target: _Image, pixels: NDArray[np.int64], start
     scale = max(float(chosen.std()), 1.0)
     u, v = ((chosen - middle) / scale).T
     M = start.copy()
-    height, width = source.residual.mask.shape
-    alike = 0.0
+    height, width = source[0].shape[:2]
     basis = np.stack([u, v, np.ones_like(u)], axis=1)
-    for there, here in zip(target.levels, source.levels, strict=True):
+    for there, here in zip(target, source, strict=True):
         wanted = here[y, x, :4]
         for _ in range(ITERATIONS):
             at = M[:, :2] @ chosen.T + M[:, 2:]
@@ -196,9 +189,8 @@ def _registered(source: _Image, target: _Image, pixels: NDArray[np.int64], start
             M = M + np.column_stack([A[:, :2], A[:, 2] - A[:, :2] @ middle])
             if np.abs(change).max() < 0.02:
                 break
-        alike = float((inside & (size < ALIKE) & (sampled[:, 3] > 0.5)).sum() / max(inside.sum(), 1))
-        alike *= bool(inside.mean() > VISIBLE)
-    return M, alike
+    alike = float((inside & (size < ALIKE) & (sampled[:, 3] > 0.5)).sum() / max(inside.sum(), 1))
+    return M, alike if inside.mean() > VISIBLE else 0.0
 
 
 def _sampled(planes: Floats, at: NDArray[np.float64]) -> Floats:
@@ -213,17 +205,15 @@ def _sampled(planes: Floats, at: NDArray[np.float64]) -> Floats:
     return above * (1 - b) + below * b
 
 
-def _explained(source: _Image, target: _Image, pixels: NDArray[np.int64], M: Map) -> Mask:
-    """(H, W) the pixels of another image that look like those of the cut-out that a map takes there."""
-    cut = np.zeros(source.residual.mask.shape, bool)
+def _explained(source: list[Floats], target: list[Floats], mask: Mask, pixels: NDArray[np.int64], M: Map) -> Mask:
+    """(H, W) the moving pixels of another image that look like those of the cut-out that a map takes there."""
+    cut, result = np.zeros_like(mask), np.zeros_like(mask)
     cut[pixels[:, 1], pixels[:, 0]] = True
-    rows, columns = np.nonzero(target.residual.mask)
+    rows, columns = np.nonzero(mask)
     back = np.linalg.inv(M[:, :2]) @ (np.stack([columns, rows]) - M[:, 2:])
     near = ndimage.binary_dilation(cut)
     inside = ndimage.map_coordinates(near.astype(np.float32), back[::-1], order=0) > 0
-    here, there = source.levels[1][..., :3], target.levels[1]
-    alike = np.abs(_sampled(here, back) - there[rows, columns, :3]).max(axis=1) < ALIKE
-    result = np.zeros(cut.shape, bool)
+    alike = np.abs(_sampled(source[1][..., :3], back) - target[1][rows, columns, :3]).max(axis=1) < ALIKE
     result[rows, columns] = inside & alike
     return result
 
@@ -251,26 +241,23 @@ def _depths(mask: Mask, depth: Floats) -> Floats:
     return result
 
 
-def _placed(cutout: _Cutout, images: Sequence[_Image], depths: Sequence[Floats], most: int) -> tuple[Floats, Floats]:
+def _placed(cutout: _Cutout, images: Sequence[Residual], depths: Sequence[Floats], most: int) -> tuple[Floats, Floats]:
     """The paths (T, n, 3) and colors (n, 3) of a cut-out, of so many points at most."""
     chosen = cutout.pixels[evenly_indices(len(cutout.pixels), most)]
     x, y = chosen.T
-    colors = images[cutout.key].residual.image[y, x]
     at = np.einsum("tij,jn->tin", cutout.maps[:, :, :2], chosen.T) + cutout.maps[:, :, 2:]
-    times = np.flatnonzero(cutout.seen)
+    height, width = depths[0].shape
     depth = np.full(len(images), np.nan)
-    for t in times.tolist():
-        height, width = depths[t].shape
+    for t in np.flatnonzero(cutout.seen).tolist():
         column, row = np.rint(at[t]).astype(np.int64).clip(0, [[width - 1], [height - 1]])
         near = depths[t][row, column]
-        depth[t] = np.median(near[np.isfinite(near)]) if np.isfinite(near).any() else np.nan
+        if np.isfinite(near).any():
+            depth[t] = np.nanmedian(near)
     depth = _smooth(depth)
     paths = np.zeros((len(images), len(chosen), 3), np.float32)
-    for t in times.tolist():
-        camera = images[t].residual.camera
-        ray = np.linalg.solve(camera.K, np.stack([at[t, 0] + 0.5, at[t, 1] + 0.5, np.ones(len(chosen))]))
-        paths[t] = (depth[t] * ray - camera.T_cam_world[:3, 3:]).T @ camera.T_cam_world[:3, :3]
-    return paths, colors.astype(np.float32)
+    for t in np.flatnonzero(cutout.seen).tolist():
+        paths[t] = points_at(images[t].camera, at[t].T + 0.5, depth[t : t + 1])
+    return paths, images[cutout.key].image[y, x].astype(np.float32)
 
 
 def _smooth(depth: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,16 +1,16 @@
-"""What a training starts from: what stands still, and the things that move, which a fit of it loses."""
+"""The start of a training: what stands still, and the things that move, which a fit of it loses; then a Trainer."""
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import nn
+from torch import Tensor, nn
 
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.discovery.acceptance import explained_share, rows_with, tracks_in_images
@@ -25,20 +25,65 @@ from lapgs_wgpu.discovery.turns import find_turns
 from lapgs_wgpu.discovery.visual_hull import hull_points
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.fields.own_field import check_own
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.morton import morton_order
 from lapgs_wgpu.train.camera_refinement import Corrections
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config
-from lapgs_wgpu.train.setup import Start, start_from_points
+from lapgs_wgpu.train.host import step_threads, torch_threads
+from lapgs_wgpu.train.parts import Parts
+from lapgs_wgpu.train.setup import Start, set_up, start_from_points
+from lapgs_wgpu.train.trainer import Trainer
 
 DYNAMICS = 0.5  # standard deviation of the dynamics attribute of a discovered Gaussian, which it shares with its part
 SHEET_DYNAMICS = 2.0  # in place of it: of all sheets, and of the last one's time
 NEARLY_ALL = 0.8  # share of the surface points that tracks explain, above which the field has little left to learn
 ALL_TURN = 0.1  # of the field's highest rates, where all that moves turns: it forgets turns sooner than places
 RAMP_STEPS = 200  # over which learning rates rise after discovery, where schedule.warm_up is 0
-STATIC_FIT = "a static fit"
 SHOWN = 2.0 / 255  # least difference from the background of an image that shows something
+
+
+def start_training(
+    config: Config,
+    dataset: Dataset | None = None,
+    device: Device | None = None,
+    *,
+    parts: Parts | None = None,
+) -> Trainer:
+    """Do motion discovery as the configuration says, and make the trainer that starts from what it finds.
+
+    Discovery is left out where `discovery.enabled` is false, the field is static, or `schedule.steps` is not larger
+    than `discovery.steps`, which a note on stderr tells, as it does where warm-up is all of a training.
+
+    Args:
+        config: as `load_config` gives it.
+        dataset: None for the one that config.data names; a built-in scene is then written into the folder runs.
+        device: None for the default adapter.
+        parts: own field, losses, density control, learning rates and callbacks.
+
+    Returns:
+        The trainer before its first step.
+
+    Raises:
+        InputError: the configuration, the data and the parts do not fit each other, or the images show nothing.
+    """
+    parts = parts or Parts()
+    user_config, resolved, dataset, device = set_up(config, dataset, device, parts)
+    check_own(resolved.field, parts.field)
+    start, steps, needed = None, resolved.schedule.steps, resolved.discovery.steps
+    if resolved.discovery.enabled and resolved.field.kind != "static":
+        if steps > needed:
+            with torch_threads(step_threads(resolved.field, device)):
+                start = discover(resolved, dataset, device, parts.field)
+        else:
+            reason = f"schedule.steps ({steps}) must be larger than discovery.steps ({needed})"
+            print(f"note: motion discovery is left out: {reason}.", file=sys.stderr, flush=True)
+    trainer = Trainer(user_config, dataset, device, start=start, parts=parts)
+    if trainer.scene.field is not None and trainer.warm_up_steps >= steps:
+        told = f"its warm-up (schedule.warm_up: {trainer.warm_up_steps} steps) is not shorter than schedule.steps ({steps})"
+        print(f"note: nothing moves in this training, since {told}.", file=sys.stderr, flush=True)
+    return trainer
 
 
 def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Module | None = None) -> Start:
@@ -64,32 +109,28 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
     generator = torch.Generator().manual_seed(config.seed)
     found = _in_hull(config, dataset, device) if dataset.is_surrounded else None
     found = found or _in_residuals(config, dataset, device, generator)
-    static, tracks, share, sheets, light = found.static, found.tracks, found.share, found.sheets, found.light
-    if share < config.discovery.least:
-        tracks = None
-    scene = scene_with(static, tracks, config, device, generator, own_field, sheets=sheets)
-    summary = f"{share:.1%} of what it lacks can be followed: nothing is added"
+    static, tracks, sheets, light = found.static, found.tracks, found.sheets, found.light
+    scene = scene_with(static, tracks, config, generator, own_field, sheets=sheets)
+    summary = f"{found.share:.1%} of what it lacks can be followed: nothing is added"
     if tracks is not None:
         steps = config.discovery.field_steps
         meter = Progress(steps, "steps of motion discovery, part 2 of 2: what moves")
-        still = len(static)
-        error = fit_field(scene, tracks, found.times, still, steps, generator, meter.at, fades=sheets, light=light)
+        error = fit_field(scene, tracks, found.times, steps, generator, meter.at, fades=sheets, light=light)
         meter.clear()
         if error is None:
-            tracks, scene = None, scene_with(static, None, config, device, generator, own_field)
-            summary = f"{share:.1%} of what it lacks can be followed, and the field moves nothing: nothing is added"
-    if tracks is not None:
-        summary = (
-            f"{len(np.unique(tracks.part))} moving parts with {len(tracks.part)} Gaussians, {share:.0%} of what it "
-            f"lacks, followed within {error:.3f} world units"
-        )
-        if light:
-            summary += f", {len(light)} of them as rigid bodies"
+            summary = "the field cannot move what it lacks: nothing is added"
+            tracks, scene = None, scene_with(static, None, config, generator, own_field, sheets=False)
+        else:
+            rigid = f", {len(light)} of them as rigid bodies" if light else ""
+            summary = (
+                f"{len(np.unique(tracks.part))} moving parts with {len(tracks.part)} Gaussians, {found.share:.0%} of "
+                f"what it lacks, followed within {error:.3f} world units{rigid}"
+            )
     order = morton_order(scene.parameters["means"].detach())
     for name, values in scene.parameters.items():
         scene.parameters[name] = torch.nn.Parameter(values.detach()[order])
     field_fitted = 0.0
-    if tracks is not None and share >= NEARLY_ALL:
+    if tracks is not None and found.share >= NEARLY_ALL:
         field_fitted = ALL_TURN if len(light) == len(np.unique(tracks.part)) else 1.0
     return Start(
         scene,
@@ -103,27 +144,27 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
 
 class _Found(NamedTuple):
     """static: what stands still. tracks: of what moves, over the times (T,). share: of the points of what moves, those
-    that tracks explain. origin: of what stands still, in words. sheets: whether each part is a sheet. light: on rigid
-    bodies. corrections: of cameras."""
+    that tracks explain. origin: of what stands still, in words. light: on rigid bodies. sheets: whether each part is
+    a sheet. corrections: of cameras."""
 
     static: Scene4D
     tracks: Tracks | None
     times: NDArray[np.float64]
     share: float
     origin: str
+    light: Mapping[int, Floats]
     sheets: bool = False
-    light: Mapping[int, Floats] = MappingProxyType({})
     corrections: Corrections | None = None
 
 
 def _in_hull(config: Config, dataset: Dataset, device: Device) -> _Found | None:
     """What moves between cameras all around, before initial points; None where nothing can be followed."""
     clouds = hull_points(dataset, config.points.box)
-    tracks = find_tracks(clouds, config.points.box)
-    share = 0.0 if tracks is None else explained_share(clouds, tracks, config.points.box)
+    tracks = find_tracks(clouds)
+    share = explained_share(clouds, tracks)
     if share < config.discovery.least:
         return None
-    return _Found(start_from_points(config, dataset, device).scene, tracks, clouds.times, share, "a start")
+    return _Found(start_from_points(config, dataset, device).scene, tracks, clouds.times, share, "a start", {})
 
 
 def _in_residuals(config: Config, dataset: Dataset, device: Device, generator: torch.Generator) -> _Found:
@@ -138,55 +179,53 @@ def _in_residuals(config: Config, dataset: Dataset, device: Device, generator: t
             f"{dataset.train[0].source} and the other {len(dataset.train) - 1} training images show nothing but the "
             f"{config.data.background} background; check the images and data.background."
         )
-    if depths is not None and not dataset.is_rig:
+    if dataset.is_rig:
+        depths = None  # a cut-out is of one camera
+    light: dict[int, Floats] = {}
+    if depths is not None:
         times = np.array([image.time for image in images])
         tracks, share = cutout_tracks(images, depths, half_side)
-        meter.clear()
-        return _Found(static, tracks, times, share, STATIC_FIT, sheets=True, corrections=corrections)
-    clouds = surface_points(images, half_side)
-    tracks = find_tracks(clouds, half_side)
-    if tracks is not None:
-        together = 2 * len(dataset.times) <= len(dataset.train)
-        tracks = tracks_in_images(tracks, clouds.times, images, static, background, together=together)
-    share = 0.0 if tracks is None else explained_share(clouds, tracks, half_side)
-    light: dict[int, Floats] = {}
-    if tracks is not None and share >= config.discovery.least:
-        stands, turns = find_turns(tracks, clouds.times, images)
+    else:
+        clouds = surface_points(images, half_side)
+        times, tracks = clouds.times, find_tracks(clouds)
+        if tracks is not None:
+            together = 2 * len(dataset.times) <= len(dataset.train)
+            tracks = tracks_in_images(tracks, times, images, static, background, together=together)
+        share = explained_share(clouds, tracks)
+    if share < config.discovery.least:
+        tracks = None
+    if tracks is not None and depths is None:
+        stands, turns = find_turns(tracks, times, images)
         if turns:
-            tracks, light = rigid_tracks(tracks, stands, turns, clouds.times, images, device, generator)
+            tracks, light = rigid_tracks(tracks, stands, turns, times, images, device, generator)
     meter.clear()
-    return _Found(static, tracks, clouds.times, share, STATIC_FIT, light=light, corrections=corrections)
+    return _Found(static, tracks, times, share, "a static fit", light, depths is not None, corrections)
 
 
 def scene_with(
     static: Scene4D,
     tracks: Tracks | None,
     config: Config,
-    device: Device,
     generator: torch.Generator,
-    own_field: nn.Module | None = None,
+    own_field: nn.Module | None,
     *,
-    sheets: bool = False,
+    sheets: bool,
 ) -> Scene4D:
     """The Gaussians of what stands still, then one for each track; the field does not move them yet."""
+    rows: dict[str, Tensor] = dict(static.parameters)
     dynamics = torch.zeros(len(static), config.field.dynamics_size)
-    if tracks is None:
-        rows = {name: values.detach().cpu() for name, values in static.parameters.items()}
-    else:
+    if tracks is not None:
         rows = rows_with(static, tracks, sheets=sheets)
-        of_part = DYNAMICS * torch.randn(int(tracks.part.max()) + 1, config.field.dynamics_size, generator=generator)
-        if (
-            sheets and config.field.dynamics_size > 1
-        ):  # shown one after another, which a layer of the field can tell by these
+        of_part = DYNAMICS * torch.randn(tracks.parts, config.field.dynamics_size, generator=generator)
+        if sheets and config.field.dynamics_size > 1:  # shown one after another, which the field can tell by these
             when = [tracks.supported[:, tracks.part == k].mean(axis=1) for k in range(len(of_part))]
             middle = np.array([np.average(np.linspace(-1, 1, len(each)), weights=each) for each in when])
             of_part[:, :2] = torch.from_numpy(np.stack([np.ones_like(middle), middle], axis=1)) * SHEET_DYNAMICS
         dynamics = torch.cat([dynamics, of_part[torch.from_numpy(tracks.part)]])
-    rows["dynamics"] = dynamics
     return Scene4D(
-        rows,
+        rows | {"dynamics": dynamics},
         config.field,
-        device,
+        static.device,
         sh_degree=static.sh_degree,
         antialiased=static.antialiased,
         seed=config.seed,

@@ -8,12 +8,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy import ndimage
-from torch import Tensor, nn
 
 from lapgs_wgpu.discovery.residual import Floats
 from lapgs_wgpu.discovery.tracks import Tracks
 from lapgs_wgpu.motion.fields.config import APPEARANCE_SCALE
-from lapgs_wgpu.motion.fields.deformation import Deformation, TimeSamples
+from lapgs_wgpu.motion.fields.deformation import TimeSamples
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.constants import CONSTANTS
@@ -39,24 +38,25 @@ def fit_field(
     scene: Scene4D,
     tracks: Tracks,
     times: NDArray[np.float64],
-    still: int,
     steps: int,
     generator: torch.Generator,
     progress: Callable[[int], None],
     *,
-    fades: bool = False,
-    light: Mapping[int, Floats] | None = None,
+    fades: bool,
+    light: Mapping[int, Floats],
 ) -> float | None:
-    """Train the field of a scene so that its last Gaussians follow the tracks, and the first `still` ones stay.
+    """Train the field of a scene so that its last Gaussians follow the tracks, and those before them stay.
 
     Each step looks at one of the times (T,). fades: whether tracks lose opacity where they are not seen. light: (T, m)
     of `rigid_tracks`, by the number of each part that is a body; of these the field learns all that lies inside, where
     Gaussians will be, and the light. Returns the mean distance of tracks and Gaussians in the end, world units; None,
     and nothing is trained, where the field moves no Gaussians.
     """
-    field = scene.field
+    field, still = scene.field, len(scene) - len(tracks.part)
     assert field is not None
     groups = [(HASH_RATE if name == "hash" else MLP_RATE, each) for name, each in field.parameter_groups().items()]
+    if not groups:
+        return None
     if (fades or light) and (head := getattr(field, "appearance", None)) is not None:  # outputs in that unit
         own = {id(parameter) for parameter in head.parameters()}
         groups = [(rate, [each for each in parameters if id(each) not in own]) for rate, parameters in groups]
@@ -66,19 +66,17 @@ def fit_field(
     optimizer = torch.optim.Adam(
         [{"params": parameters, "lr": rate} for rate, parameters in groups], eps=ADAM_EPS, fused=True
     )
-    device = scene.parameters["means"].device
-    paths, supported = torch.from_numpy(tracks.paths).to(device), torch.from_numpy(tracks.supported).to(device)
-    beside = torch.from_numpy(ndimage.maximum_filter1d(tracks.supported, 3, axis=0)).to(device)
-    moving = torch.arange(still, still + len(tracks.part), device=device)
-    canonical = scene.parameters["means"].detach()
-    first = torch.arange(len(tracks.part), device=device)  # of the points of its body, for each
-    count = torch.ones_like(first)
-    shades = torch.zeros(*tracks.paths.shape[:2], 3, device=device)
-    for k, factors in (light or {}).items():
+    paths, supported = torch.from_numpy(tracks.paths), torch.from_numpy(tracks.supported)
+    beside = torch.from_numpy(ndimage.maximum_filter1d(tracks.supported, 3, axis=0)).float()
+    canonical, codes = scene.parameters["means"].detach(), scene.parameters.get("dynamics")
+    asked = torch.arange(len(tracks.part))
+    first, count = torch.arange(len(asked)), torch.ones_like(asked)  # of the points of its body, for each
+    shades = torch.zeros(*tracks.paths.shape[:2], 3)
+    for k, factors in light.items():
         body = np.flatnonzero(tracks.part == k)
         first[body], count[body] = int(body[0]), len(body)
         colors = CONSTANTS["SH_OFFSET"] / CONSTANTS["SH_C0"] + scene.parameters["sh_dc"].detach()[still + body, 0]
-        shades[:, body] = (torch.from_numpy(factors).to(device)[..., None] - 1) * colors
+        shades[:, body] = (torch.from_numpy(factors)[..., None] - 1) * colors
     order: list[int] = []
     errors: list[float] = []
     at_once, most = (AT_ONCE, MOVING // FEWER) if fades else (1, MOVING)
@@ -87,47 +85,45 @@ def fit_field(
         for _ in range(at_once):
             order = order or torch.randperm(len(times), generator=generator).tolist()
             now.append(order.pop())
-        staying = torch.randint(max(still, 1), (min(still, STILL),), generator=generator).to(device)
-        asked = moving
-        if len(moving) > most:
-            asked = moving[torch.randint(len(moving), (most,), generator=generator).to(device)]
-        on_track = asked - still
-        rows = torch.cat([asked, staying])
-        other, way = on_track, torch.zeros(len(asked), 1, device=device)
+        staying = torch.randint(max(still, 1), (min(still, STILL),), generator=generator)
+        if len(tracks.part) > most:
+            asked = torch.randint(len(tracks.part), (most,), generator=generator)
+        other, way = asked, torch.zeros(len(asked), 1)
         if light:
-            drawn = torch.rand(2, len(asked), 1, generator=generator).to(device)
-            other = first[on_track] + (drawn[0, :, 0] * count[on_track]).long()
-            way = drawn[1] * (WITHIN + BEYOND) - BEYOND
-        means = torch.cat([canonical[asked].lerp(canonical[still + other], way), canonical[staying]])
-        dynamics = scene.parameters["dynamics"].detach()[rows] if "dynamics" in scene.parameters else None
-        loss, distance = torch.zeros((), device=device), 0.0
-        for at, move in zip(now, _moves(field, means, [float(times[at]) for at in now], dynamics), strict=True):
+            along, way = torch.rand(2, len(asked), 1, generator=generator)
+            other = first[asked] + (along[:, 0] * count[asked]).long()
+            way = way * (WITHIN + BEYOND) - BEYOND
+        rows = torch.cat([still + asked, staying])
+        means = torch.cat([canonical[still + asked].lerp(canonical[still + other], way), canonical[staying]])
+        dynamics = None if codes is None else codes.detach()[rows]
+        sizes = [len(asked), len(staying)]
+        loss, distance = torch.zeros(()), 0.0
+        first_time, *others = (float(times[at]) for at in now)
+        samples = TimeSamples(torch.arange(len(means)), tuple(others)) if others else None
+        for at, move in zip(now, field.at_times(means, first_time, dynamics, time_samples=samples), strict=True):
+            seen, targets = supported[at, asked], paths[at, asked].lerp(paths[at, other], way)
             moved = move.apply_to_means(means)
-            seen = supported[at, on_track]
-            targets = paths[at, on_track].lerp(paths[at, other], way)
             squared = (moved - torch.cat([targets, means[len(asked) :]])).square().sum(dim=1)
             far = (squared + SOFTENING**2).sqrt()
             if fades:  # few are seen at a time; between two times, those of both
-                weights = HIDDEN + (1 - HIDDEN) * beside[at, on_track].float()
-                loss = loss + (weights * far[: len(asked)]).sum() / weights.sum() + far[len(asked) :].mean()
+                weights = HIDDEN + (1 - HIDDEN) * beside[at, asked]
+                of_tracks, of_still = far.split(sizes)
+                loss = loss + (weights * of_tracks).sum() / weights.sum() + of_still.mean()
             else:
-                weights = torch.cat([seen.float(), torch.ones(len(staying), device=device)])
-                loss = loss + (weights * far).mean()
-            stiff = 1.0 if move.d_scales is None or not fades else SHEET_STIFF
+                loss = loss + (torch.cat([seen.float(), torch.ones(len(staying))]) * far).mean()
             loss = loss + SHAPE_WEIGHT * sum(
                 (weight * change).abs().mean()
-                for weight, change in ((stiff, move.d_scales), (1.0, move.d_quats))
+                for weight, change in ((SHEET_STIFF if fades else 1.0, move.d_scales), (1.0, move.d_quats))
                 if change is not None
             )
             if light and move.d_dc is not None:
-                shade = shades[at, on_track].lerp(shades[at, other], way)
-                of_tracks, of_still = move.d_dc.split([len(asked), len(staying)])
+                of_tracks, of_still = move.d_dc.split(sizes)
+                shade = shades[at, asked].lerp(shades[at, other], way)
                 loss = loss + LIGHT_WEIGHT * ((of_tracks - shade).abs().mean() + of_still.abs().mean())
             if fades and move.d_opacity is not None:
-                fading = (move.d_opacity + FADED * torch.cat([~seen, seen.new_zeros(len(staying))])).abs()
-                of_tracks, of_still = fading.split([len(asked), len(staying)])
-                kinds = of_tracks[seen], of_tracks[~seen], of_still
-                loss = loss + FADE_WEIGHT * sum(each.mean() for each in kinds if len(each))
+                of_tracks, of_still = move.d_opacity.split(sizes)
+                kinds = of_tracks[seen], of_tracks[~seen] + FADED, of_still
+                loss = loss + FADE_WEIGHT * sum(each.abs().mean() for each in kinds if len(each))
             distance += float((seen * squared[: len(asked)].detach().sqrt()).sum() / seen.sum().clamp(min=1))
         if not loss.requires_grad:
             return None
@@ -140,14 +136,6 @@ def fit_field(
         progress(step + 1)
     optimizer.zero_grad()
     return float(np.mean(errors[-max(1, steps // 10) :]))
-
-
-def _moves(field: nn.Module, means: Tensor, times: list[float], dynamics: Tensor | None) -> list[Deformation]:
-    """The deformation at each time."""
-    if len(times) > 1 and isinstance(field, GridField):
-        others = TimeSamples(torch.arange(len(means), device=means.device), tuple(times[1:]))
-        return field.at_times(means, times[0], dynamics, None, others)
-    return [field(means, t, dynamics, None) for t in times]
 
 
 def _tell_times(field: GridField, generator: torch.Generator) -> None:

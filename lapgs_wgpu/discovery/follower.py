@@ -7,12 +7,14 @@ around both finds the translation that explains most points; and a registration 
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.evenly import evenly_indices
 from lapgs_wgpu.discovery.residual import Floats, cubic_grid
-from lapgs_wgpu.discovery.surface_points import Points, parts_of
+from lapgs_wgpu.discovery.surface_points import PointClouds, Points
 from lapgs_wgpu.discovery.trajectories import Trajectory
 
 LEAST_PART = 12  # points
@@ -23,9 +25,7 @@ CANDIDATES = 4  # best places of the rough search
 COLOR_SPREAD = 0.3
 NOISE = 0.1  # weight of the hypothesis that a point belongs to no track
 LOST = 0.3  # a part is lost where it explains less than this share of what it usually does
-# In half sides of the box, 1.3 in the presets:
-LINK = 0.11  # points closer than this are of one part
-UNIT = 0.077  # half the size of a small object: the search goes by this
+UNIT = 0.077  # half sides of the box; half the size of a small object: the search goes by this
 # In UNIT:
 SEARCH = 2.4  # radius around the predicted place
 SEARCH_STEPS = 1.2, 0.6  # of a rough search, and of a fine one around its best places
@@ -36,56 +36,65 @@ STIFF, SOFT = 5.0, 2.0  # standard deviation of the kernel over which a part mov
 WIDE, NARROW = 0.6, 0.35  # standard deviation of the registration, first and last
 
 
-class Follower:
-    """Follows the parts of a key time's points. tint: of `PointClouds`."""
+@dataclass
+class _Part:
+    """members: (n,) rows of its points. expected: (T, 3) centers by a trajectory; None without one. usual: how much it
+    explained at the times so far. lost: how many times ago it was found. speed: world units from a time to the next."""
 
-    def __init__(self, template: Points, half_side: float, tint: float) -> None:
-        unit = UNIT * half_side
-        part = parts_of(template, LINK * half_side, tint)
+    members: NDArray[np.int64]
+    expected: Floats | None
+    usual: list[float] = field(default_factory=list)
+    lost: int = 0
+    speed: float = 0.0
+
+
+class Follower:
+    """Follows the parts of a key time's points, to which positions (n, 3), colors (n, 3) and part (n,) belong."""
+
+    def __init__(self, template: Points, key: int, clouds: PointClouds, trajectories: list[Trajectory]) -> None:
+        self._key, self._clouds, self._unit = key, clouds, UNIT * clouds.half_side
+        part = clouds.parts(template)
         kept = np.bincount(part)[part] >= LEAST_PART
         self.positions, self.colors = template.positions[kept], template.colors[kept]
         self.part = np.unique(part[kept], return_inverse=True)[1].ravel()
         sizes = np.bincount(self.part) if len(self.part) else np.zeros(0, np.int64)
         # Large parts choose first: what they explain is less attractive to the small ones.
-        self._members = [np.flatnonzero(self.part == k) for k in np.argsort(-sizes, kind="stable")]
-        self._unit, self._half_side = unit, half_side
+        members = [np.flatnonzero(self.part == k) for k in np.argsort(-sizes, kind="stable")]
+        self._parts = [_Part(each, self._expected(each, trajectories)) for each in members]
         same = self.part[:, None] == self.part[None]
         sq_distances = ((self.positions[:, None] - self.positions[None]) ** 2).sum(axis=2)
-        self._kernels = [np.exp(-sq_distances / (2 * (h * unit) ** 2)).astype(np.float32) * same for h in (STIFF, SOFT)]
-        rough = unit * _grid(SEARCH, SEARCH_STEPS[0])
-        self._rough = rough[np.linalg.norm(rough, axis=1) < (SEARCH + 1e-3) * unit]
-        self._fine = unit * _grid(SEARCH_STEPS[1], SEARCH_STEPS[1])
-        self._usual: list[list[float]] = [[] for _ in self._members]
-        self._lost = [0] * len(self._members)
-        self._speed = [0.0] * len(self._members)  # world units from one time to the next
+        self._kernels = [
+            np.exp(-sq_distances / (2 * (h * self._unit) ** 2)).astype(np.float32) * same for h in (STIFF, SOFT)
+        ]
+        coarse, fine = SEARCH_STEPS
+        rough = cubic_grid(self._unit * np.arange(-SEARCH, SEARCH + 1e-6, coarse, dtype=np.float32))
+        self._rough = rough[np.linalg.norm(rough, axis=1) < (SEARCH + 1e-3) * self._unit]
+        self._fine = cubic_grid(self._unit * np.arange(-fine, fine + 1e-6, fine, dtype=np.float32))
 
-    def follow(
-        self, key: int, times: NDArray[np.float64], clouds: list[Points], trajectories: list[Trajectory]
-    ) -> Floats:
-        """(T, n, 3) paths over all times."""
-        expected = [self._expected(members, key, trajectories) for members in self._members]
-        paths = np.zeros((len(times), *self.positions.shape), np.float32)
-        paths[key] = self.positions
-        order = sorted((i for i in range(len(times)) if i != key), key=lambda i: (abs(i - key), i))
-        past: dict[int, list[int]] = {1: [key], -1: [key]}  # times in the order in which a side was followed
-        for i in order:
-            side = 1 if i > key else -1
-            known = past[side] if len(past[side]) >= MEMORY else past[-side][1:MEMORY][::-1] + past[side]
-            start = self._predict(times[known[-MEMORY:]], paths[known[-MEMORY:]], times[i])
-            centers = [None if path is None else path[i] for path in expected]
-            paths[i] = self._register(start, clouds[i], centers, first=len(past[side]) == 1)
-            past[side].append(i)
-        return paths
-
-    def _expected(self, members: NDArray[np.int64], key: int, trajectories: list[Trajectory]) -> Floats | None:
+    def _expected(self, members: NDArray[np.int64], trajectories: list[Trajectory]) -> Floats | None:
         """(T, 3) centers of a part by the trajectory that passes it at the key time; None where none does."""
         center = self.positions[members].mean(axis=0)
         radius = float(np.linalg.norm(self.positions[members] - center, axis=1).max())
         for trajectory in trajectories:
-            offset = center - trajectory.centers[key]
-            if trajectory.seen[max(0, key - 1) : key + 2].any() and np.linalg.norm(offset) < max(radius, self._unit):
+            offset = center - trajectory.centers[self._key]
+            seen = trajectory.seen[max(0, self._key - 1) : self._key + 2].any()
+            if seen and np.linalg.norm(offset) < max(radius, self._unit):
                 return trajectory.centers + offset
         return None
+
+    def follow(self) -> Floats:
+        """(T, n, 3) paths over all times."""
+        key, times = self._key, self._clouds.times
+        paths = np.zeros((len(times), *self.positions.shape), np.float32)
+        paths[key] = self.positions
+        past: dict[int, list[int]] = {1: [key], -1: [key]}  # times in the order in which a side was followed
+        for i in sorted(range(len(times)), key=lambda i: (abs(i - key), i))[1:]:
+            side = 1 if i > key else -1
+            known = past[side] if len(past[side]) >= MEMORY else past[-side][1:MEMORY][::-1] + past[side]
+            start = self._predict(times[known[-MEMORY:]], paths[known[-MEMORY:]], times[i])
+            paths[i] = self._register(start, i, first=len(past[side]) == 1)
+            past[side].append(i)
+        return paths
 
     def _predict(self, times: NDArray[np.float64], paths: Floats, t: float) -> Floats:
         """Positions (n, 3) at time t, from those at earlier times: each part goes on by its mean's path."""
@@ -93,29 +102,29 @@ class Follower:
         if len(times) < 2:
             return positions
         span = max(float(np.abs(times - times[-1]).max()), 1e-9)
-        degree = 1 if len(times) < 4 else 2
-        powers = np.arange(degree + 1)
+        powers = np.arange(2 if len(times) < 4 else 3)
         basis, at = ((times - times[-1]) / span)[:, None] ** powers, ((t - times[-1]) / span) ** powers
-        for k, members in enumerate(self._members):
-            centers = paths[:, members].mean(axis=1)
-            self._speed[k] = float(np.linalg.norm(np.diff(centers, axis=0), axis=1).mean())
-            if np.abs(centers[-1]).max() > self._half_side:  # it has left the box
+        for part in self._parts:
+            centers = paths[:, part.members].mean(axis=1)
+            ways = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+            part.speed = float(ways.mean())
+            if np.abs(centers[-1]).max() > self._clouds.half_side:  # it has left the box
                 continue
             step = at @ np.linalg.lstsq(basis, centers, rcond=None)[0] - centers[-1]
-            longest = 1.5 * float(np.linalg.norm(np.diff(centers, axis=0), axis=1).max())
-            positions[members] += step * min(1.0, longest / max(float(np.linalg.norm(step)), 1e-9))
+            longest = 1.5 * float(ways.max())
+            positions[part.members] += step * min(1.0, longest / max(float(np.linalg.norm(step)), 1e-9))
         return positions
 
-    def _register(self, start: Floats, points: Points, expected: list[Floats | None], *, first: bool) -> Floats:
-        """Positions (n, 3) of the tracks' points among the points of a time, from a prediction and from where the
+    def _register(self, start: Floats, i: int, *, first: bool) -> Floats:
+        """Positions (n, 3) of the tracks' points among the points of time i, from a prediction and from where the
         parts' centers are expected."""
-        points = points.thinned(DATA)
+        points = self._clouds.clouds[i].thinned(DATA)
         positions = start.copy()
         if len(points.scores) == 0:
             return positions
         free = np.ones(len(points.scores), np.float32)
-        for k, members in enumerate(self._members):
-            free *= 1.0 - 0.9 * self._search(k, members, positions, points, free, expected[k], first=first)
+        for part in self._parts:
+            free *= 1.0 - 0.9 * self._search(part, positions, points, free, i, first=first)
         data, weights = points.positions, points.scores[:, None]
         alike = 0.2 + 0.8 * np.exp(-_sq_distances(points.colors, self.colors) / (2 * COLOR_SPREAD**2))
         for step in range(ROUNDS):
@@ -128,24 +137,14 @@ class Follower:
             positions = positions + (kernel @ (belongs.T @ data - mass * positions)) / (kernel @ mass + 1e-2)
         return positions
 
-    def _search(
-        self,
-        k: int,
-        members: NDArray[np.int64],
-        positions: Floats,
-        points: Points,
-        free: Floats,
-        expected: Floats | None,
-        *,
-        first: bool,
-    ) -> Floats:
-        """Shift a part in `positions` to where it explains most, around where it is and around where its center is
-        expected; (m,) how well it explains each point there."""
-        widening = min(max(1.0, FAST * self._speed[k] / (SEARCH * self._unit)), 2.0)
-        reach = 1.5 if first else widening + 0.25 * min(self._lost[k], 4)
+    def _search(self, part: _Part, positions: Floats, points: Points, free: Floats, i: int, *, first: bool) -> Floats:
+        """Shift a part in `positions` to where it explains most of the points of time i, around where it is and around
+        where its center is expected; (m,) how well it explains each point there."""
+        widening = min(max(1.0, FAST * part.speed / (SEARCH * self._unit)), 2.0)
+        reach = 1.5 if first else widening + 0.25 * min(part.lost, 4)
         starts = [np.zeros(3, np.float32)]
-        if expected is not None:
-            starts.append(expected - positions[members].mean(axis=0))
+        if part.expected is not None:
+            starts.append(part.expected[i] - positions[part.members].mean(axis=0))
         reaches, spreads = np.array([reach, 1.0], np.float32), np.array([widening, 1.0]) * PRIOR * self._unit
 
         def prior(shifts: Floats) -> NDArray[np.float64]:
@@ -154,45 +153,33 @@ class Follower:
             return np.max(likely, axis=0)
 
         shifts = np.concatenate([start + scale * self._rough for start, scale in zip(starts, reaches, strict=False)])
-        rough, _ = self._explained(members, positions, points, free, shifts, SEARCH_SPREADS[0])
+        rough, _ = self._explained(part, positions, points, free, shifts, SEARCH_SPREADS[0])
         chosen = np.argsort(-rough * prior(shifts), kind="stable")[:CANDIDATES]
         scale = reaches[chosen // len(self._rough)][:, None, None]
         shifts = (shifts[chosen][:, None] + scale * self._fine).reshape(-1, 3)
-        scores, near = self._explained(members, positions, points, free, shifts, SEARCH_SPREADS[1])
+        scores, near = self._explained(part, positions, points, free, shifts, SEARCH_SPREADS[1])
         best = int((scores * prior(shifts)).argmax())
-        if self._usual[k] and scores[best] < LOST * np.median(self._usual[k]):
-            self._lost[k] += 1
-            if expected is not None:
-                positions[members] += expected - positions[members].mean(axis=0)
+        if part.usual and scores[best] < LOST * np.median(part.usual):
+            part.lost += 1
+            positions[part.members] += starts[-1]
             return np.zeros(len(free), np.float32)
-        self._usual[k].append(float(scores[best]))
-        self._lost[k] = 0
-        positions[members] += shifts[best]
+        part.usual.append(float(scores[best]))
+        part.lost = 0
+        positions[part.members] += shifts[best]
         return near[best]
 
     def _explained(
-        self,
-        members: NDArray[np.int64],
-        positions: Floats,
-        points: Points,
-        free: Floats,
-        shifts: Floats,
-        spread: float,
+        self, part: _Part, positions: Floats, points: Points, free: Floats, shifts: Floats, spread: float
     ) -> tuple[Floats, Floats]:
         """(s,) how much of the points a part explains when it is moved by each of the shifts (s, 3), and (s, m) how
         near it then is to each of the points."""
-        some = members[evenly_indices(len(members), 24)]
+        some = part.members[evenly_indices(len(part.members), 24)]
         moved = (points.positions.T[:, None] - shifts.T[:, :, None]).reshape(3, -1)
         nearest, squared = _nearest(moved, positions[some])
         near = np.exp(-squared / (2 * (spread * self._unit) ** 2)).reshape(len(shifts), -1)
         pairs = 0.3 + 0.7 * np.exp(-_sq_distances(points.colors, self.colors[some]) / (2 * 0.35**2))
         alike = pairs[np.arange(len(points.colors)), nearest.reshape(near.shape)]
         return (near * alike * free * points.scores).sum(axis=1), near
-
-
-def _grid(half: float, step: float) -> Floats:
-    """(n, 3) places of a cubic grid of this spacing, up to `half` from 0 along each axis."""
-    return cubic_grid(np.arange(-half, half + 1e-6, step, dtype=np.float32))
 
 
 def _nearest(a: Floats, b: Floats) -> tuple[NDArray[np.uint8], Floats]:

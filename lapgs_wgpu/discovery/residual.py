@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,22 +24,6 @@ PARTLY = 0.3  # share of a thing that masks tell, from which on it is a mover
 def cubic_grid(axis: NDArray[Any]) -> NDArray[Any]:
     """(n^3, 3) places of a cubic grid with these coordinates (n,) along each axis."""
     return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-
-
-class Samples(NamedTuple):
-    """Values of an image at projected points (...): mask in [0, 1], colors (..., 3), and whether the image has them."""
-
-    mask: Floats
-    colors: Floats
-    inside: Mask
-
-
-class Rays(NamedTuple):
-    """Rays of moving pixels: directions (n, 3) of depth 1, blurred colors (n, 3) and colors of the pixels (n, 3)."""
-
-    directions: Floats
-    blurred: Floats
-    colors: Floats
 
 
 class Residual:
@@ -76,8 +60,9 @@ class Residual:
         colors = ndimage.gaussian_filter(self.image * self.mask[..., None], (BLUR, BLUR, 0))
         return (colors / np.maximum(weight, 1e-3)).astype(np.float32)
 
-    def sample(self, points: Floats) -> Samples:
-        """Values at points (..., 3), world units, at the pixels that they project to."""
+    def sample(self, points: Floats) -> tuple[Floats, Floats, Mask]:
+        """The mask (...) in [0, 1], blurred colors (..., 3), and whether the image shows them (...), of points
+        (..., 3), world units, at the pixels that they project to."""
         K, T = self.camera.K.astype(np.float32), self.camera.T_cam_world.astype(np.float32)
         seen = points @ T[:3, :3].T + T[:3, 3]
         depth = seen[..., 2]
@@ -86,22 +71,23 @@ class Residual:
         column, row = np.floor(at[..., 0]), np.floor(at[..., 1])
         inside = (depth > 1e-2) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
         pixel = np.where(inside, row * width + column, 0).astype(np.int64)
-        return Samples(self._soft.ravel()[pixel] * inside, self._blurred.reshape(-1, 3)[pixel], inside)
+        return self._soft.ravel()[pixel] * inside, self._blurred.reshape(-1, 3)[pixel], inside
 
     def moving_within(self, middle: NDArray[np.float64], radius: float) -> Mask:
         """(H, W), the moving pixels in a disc, both in pixels."""
         rows, columns = np.indices(self.mask.shape) + 0.5
         return self.mask & (np.hypot(columns - middle[0], rows - middle[1]) < radius)
 
-    def rays(self, most: int) -> Rays:
-        """Rays of at most `most` moving pixels, evenly chosen."""
+    def rays(self, most: int) -> tuple[Floats, Floats, Floats]:
+        """Of at most `most` moving pixels, evenly chosen, the directions (n, 3) of depth 1, the blurred colors (n, 3),
+        and their own (n, 3)."""
         rows, columns = np.nonzero(self.mask)
         chosen = evenly_indices(len(rows), most)
         rows, columns = rows[chosen], columns[chosen]
         K = self.camera.K
         u, v = (columns + 0.5 - K[0, 2]) / K[0, 0], (rows + 0.5 - K[1, 2]) / K[1, 1]
         directions = np.stack([u, v, np.ones(len(rows))], axis=1) @ self.camera.T_cam_world[:3, :3]
-        return Rays(directions.astype(np.float32), self._blurred[rows, columns], self.image[rows, columns])
+        return directions.astype(np.float32), self._blurred[rows, columns], self.image[rows, columns]
 
 
 def _completed(moving: Mask, differs: Mask) -> Mask:

@@ -49,14 +49,16 @@ def rigid_tracks(
     radii = torch.tensor([part_radius(tracks, k) for k in parts])
     others = ~np.isin(stands[tracks.part], parts)
     R0 = torch.from_numpy(np.stack([rotations[k] for k in parts], axis=1)).float()
-    centers = torch.from_numpy(np.stack([tracks.paths[:, tracks.part == k].mean(axis=1) for k in parts], axis=1))
+    centers = torch.from_numpy(np.stack([tracks.center(k) for k in parts], axis=1))
     soft_paths, soft_colors = torch.from_numpy(tracks.paths[:, others]), torch.from_numpy(tracks.colors[others])
     count = len(parts) * POINTS
     points = torch.from_numpy(directions(POINTS)).float() * radii[:, None, None]
     size = torch.log(SPACING * (4 * np.pi / POINTS) ** 0.5 * radii)[:, None].repeat(1, POINTS).ravel()
     soft_size = torch.full((int(others.sum()),), float(size.mean()))
-    weights = {name: parabolas(times, np.ones(len(times)), spread) for name, spread in SPREADS.items()}
-    around = {name: torch.from_numpy(each).float() for name, each in weights.items()}
+    around = {
+        name: torch.from_numpy(parabolas(times, np.ones(len(times)), spread)).float()
+        for name, spread in SPREADS.items()
+    }
     values = {
         "points": points,
         "colors": torch.cat([torch.full((count, 3), 0.4), soft_colors]),
@@ -75,6 +77,11 @@ def rigid_tracks(
         turned = torch.linalg.cross(torch.eye(3).expand(*turns.shape, 3), turns[..., None, :])
         return torch.linalg.matrix_exp(turned) @ R0[at], centers[at] + shifts
 
+    def light_on(arms: Tensor) -> Tensor:
+        """(..., p, POINTS) on points at these places (..., p, POINTS, 3) from the centers."""
+        ways = nn.functional.normalize(arms.detach(), dim=-1).unbind(dim=-1)
+        return (torch.stack(harmonics(*ways), dim=-1) @ values["light"][:, :, None])[..., 0]
+
     order: list[int] = []
     errors = np.zeros((2, len(parts)))  # of the static fit and of the drawing, where a part is, at the end
     for step in range(STEPS):
@@ -85,15 +92,13 @@ def rigid_tracks(
             group["lr"] = RATES[group["name"]] * max(LAST, min(1.0, 2.0 * (STEPS - step) / STEPS))
         R, center = poses(at)
         arms = values["points"] @ R.transpose(1, 2)
-        x, y, z = nn.functional.normalize(arms.detach(), dim=2).unbind(dim=2)
-        lit = (torch.stack(harmonics(x, y, z), dim=2) @ values["light"][:, :, None]).reshape(-1, 1)
         means = torch.cat([(arms + center[:, None]).reshape(-1, 3), soft_paths[at]])
         drawn = rasterize(
             means,
             torch.tensor([1.0, 0, 0, 0]).repeat(len(means), 1),
             values["sizes"].exp()[:, None].repeat(1, 3),
             values["opacities"].sigmoid(),
-            values["colors"] * torch.cat([lit, torch.ones(len(soft_size), 1)]),
+            values["colors"] * torch.cat([light_on(arms).reshape(-1, 1), torch.ones(len(soft_size), 1)]),
             image.camera,
             antialiased=True,
             depth=False,
@@ -106,14 +111,16 @@ def rigid_tracks(
         optimizer.step()
         if step >= STEPS - len(images):
             absolute = np.abs(image.still - image.image), difference.numpy(force=True)
-            for n, where in enumerate(_shown(image, center.numpy(force=True), radii.numpy())):
+            middles, depths = image.camera.project(center.numpy(force=True).astype(np.float64))
+            reach = image.camera.K[0, 0] * radii.double().numpy() / np.maximum(depths, 1e-6)
+            for n in range(len(parts)):
+                where = image.moving_within(middles[n], reach[n])
                 errors[:, n] += [each[where].sum() for each in absolute]
     rigid = errors[1] < UNEXPLAINED * errors[0]
     with torch.no_grad():
         R, center = poses(slice(None))
         paths = values["points"] @ R.transpose(2, 3) + center[:, :, None]
-        arms = nn.functional.normalize(paths - center[:, :, None], dim=3)
-        light = (torch.stack(harmonics(*arms.unbind(dim=3)), dim=3) @ values["light"][:, :, None])[..., 0]
+        light = light_on(paths - center[:, :, None])
         mean = light.mean(dim=0)
         colors = (values["colors"][:count].reshape(len(parts), POINTS, 3) * mean[..., None]).clamp(0, 1).numpy()
         lights = (light / mean).numpy()
@@ -127,17 +134,8 @@ def _with_bodies(tracks: Tracks, stands: NDArray[np.int64], bodies: Mapping[int,
     others = ~np.isin(stands[tracks.part], list(bodies))
     parts = [tracks.rows(others)]
     for k, (paths, colors) in bodies.items():
-        members = tracks.part == k
-        away = np.linalg.norm(tracks.paths[:, members].mean(axis=1) - tracks.positions[members].mean(axis=0), axis=1)
-        seen = np.repeat(tracks.supported[:, members][:, :1], POINTS, axis=1)
+        part = tracks.rows(tracks.part == k)
+        away = np.linalg.norm(tracks.center(k) - part.positions.mean(axis=0), axis=1)
+        seen = np.repeat(part.supported[:, :1], POINTS, axis=1)
         parts.append(Tracks(paths[int(away.argmin())], colors, np.full(POINTS, k), paths, seen))
     return all_of(parts)
-
-
-def _shown(image: Residual, centers: Floats, radii: Floats) -> list[NDArray[np.bool_]]:
-    """For each ball (n, 3) of these radii (n,) the moving pixels (H, W) within its outline."""
-    middles, depths = image.camera.project(centers.astype(np.float64))
-    return [
-        image.moving_within(middle, image.camera.K[0, 0] * radius / depth)
-        for middle, depth, radius in zip(middles, np.maximum(depths, 1e-6), radii, strict=True)
-    ]

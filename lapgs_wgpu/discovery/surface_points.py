@@ -30,10 +30,12 @@ COLOR_SHARE = 0.7  # of a vote that depends on the color
 GRID = 48  # cells along an axis of the grid of what is residual at all times
 ALWAYS, ALWAYS_WIDTH = 0.8, 0.25  # share of all images, above which a residual is no motion; width of the transition
 LEAST_SCORE = 0.5  # of a point
-MOTION = 0.05  # box half sides; way from one time to the next that a depth must allow for
-MIDDLE = 2.0  # box half sides; standard deviation of depths around that of the middle of the scene
 PLATEAU = 0.1  # scores within this share of the best one count as equal; their middle is taken
-LONELY = 0.12  # box half sides; a point is dropped whose fourth neighbour is further
+# In half sides of the box, 1.3 in the presets:
+MOTION = 0.05  # way from one time to the next that a depth must allow for
+MIDDLE = 2.0  # standard deviation of depths around that of the middle of the scene
+LONELY = 0.12  # a point is dropped whose fourth neighbour is further
+LINK = 0.11  # points closer than this are of one part
 
 
 class Points(NamedTuple):
@@ -58,11 +60,15 @@ def merged(parts: Iterable[Points]) -> Points:
 
 
 class PointClouds(NamedTuple):
-    """The surface points of all times (T,), ascending, and the cloud of each. tint: how far apart points of one place
-    are that differ by 1 in color, world units, where their colors tell things that touch."""
+    """The surface points of all times (T,), ascending, and the cloud of each, within [-half_side, half_side]^3.
+
+    tint: how far apart points of one place are that differ by 1 in color, world units, where their colors tell things
+    that touch.
+    """
 
     times: NDArray[np.float64]
     clouds: tuple[Points, ...]
+    half_side: float
     tint: float = 0.0
 
     @property
@@ -70,83 +76,77 @@ class PointClouds(NamedTuple):
         """Number of points over all times."""
         return sum(len(cloud.scores) for cloud in self.clouds)
 
+    def parts(self, points: Points) -> NDArray[np.int64]:
+        """(n,) number of the connected part of each of some points, where points closer than LINK are connected."""
+        positions = np.hstack([points.positions, self.tint * points.colors]) if self.tint else points.positions
+        pairs = cKDTree(positions).query_pairs(LINK * self.half_side, output_type="ndarray")
+        graph = coo_array(
+            (np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(positions), len(positions))
+        )
+        return connected_components(graph, directed=False)[1].astype(np.int64)
+
+    def nearest(self, paths: Floats) -> list[tuple[NDArray[np.float64], NDArray[np.int64]]]:
+        """For each time the distances (n,) of its points to the nearest track, paths (T, m, 3), and its number (n,)."""
+        return [cKDTree(path).query(points.positions) for path, points in zip(paths, self.clouds, strict=True)]
+
 
 def surface_points(images: Sequence[Residual], half_side: float) -> PointClouds:
     """Surface points of what moves, for each distinct time of the images, within [-half_side, half_side]^3."""
-    always = _Always(images, half_side)
-    found = [_points(image, _neighbors(images, i), always, half_side) for i, image in enumerate(images)]
-    times = np.unique([image.time for image in images])
-    clouds = []
-    for time in times:
-        clouds.append(
-            _dense(merged(points for points, image in zip(found, images, strict=True) if image.time == time), half_side)
-        )
-    return PointClouds(times, tuple(clouds))
+    always = _always(images, half_side)
+    taken = np.array([image.time for image in images])
+    times = np.unique(taken)
+    step = float(np.diff(times).mean()) if len(times) > 1 else 1.0
+    found: list[list[Points]] = [[] for _ in times]
+    for i, image in enumerate(images):
+        lapses = np.abs(taken - image.time) / step
+        nearest = [n for n in np.argsort(lapses, kind="stable") if n != i][:NEIGHBORS]
+        neighbors = [(images[n], float(lapses[n])) for n in nearest]
+        found[np.searchsorted(times, image.time)].append(_points(image, neighbors, always, half_side))
+    return PointClouds(times, tuple(_dense(merged(each), half_side) for each in found), half_side)
 
 
-class _Neighbor(NamedTuple):
-    """An image of a near time. lapse: until then, in time steps. weight: of its vote."""
-
-    image: Residual
-    lapse: float
-    weight: float
-
-    def doubt(self, eye: Floats, half_side: float) -> float:
-        """Standard deviation of the depths, world units, at which things in the middle of the scene seem to be that
-        move while a camera goes from `eye` (3,) to this one."""
-        parallax = np.linalg.norm(self.image.camera.position - eye) / max(float(np.linalg.norm(eye)), 1e-6)
-        return MOTION * half_side * self.lapse / max(float(parallax), 1e-6)
-
-
-def _neighbors(images: Sequence[Residual], of: int) -> list[_Neighbor]:
-    """The images that are nearest in time."""
-    times = np.array([image.time for image in images])
-    distinct = np.unique(times)
-    step = float(np.diff(distinct).mean()) if len(distinct) > 1 else 1.0
-    lapses = np.abs(times - times[of]) / step
-    order = [i for i in np.lexsort((np.arange(len(times)), lapses)) if i != of][:NEIGHBORS]
-    return [_Neighbor(images[i], float(lapses[i]), float(1.0 / (1.0 + (lapses[i] / SPAN) ** 2))) for i in order]
-
-
-def _points(image: Residual, neighbors: list[_Neighbor], always: _Always, half_side: float) -> Points:
-    rays = image.rays(RAYS)
-    if len(rays.directions) == 0 or not neighbors:
+def _points(image: Residual, neighbors: list[tuple[Residual, float]], always: Floats, half_side: float) -> Points:
+    """neighbors: images and how many time steps they are apart. always: of `_always`."""
+    directions, blurred, colors = image.rays(RAYS)
+    if len(directions) == 0 or not neighbors:
         empty = np.zeros((0, 3), np.float32)
         return Points(empty, empty, np.zeros(0, np.float32))
     eye = image.camera.position.astype(np.float32)
-    depths = _depths(eye, rays.directions, half_side)
-    places = eye + depths[..., None] * rays.directions[:, None]
-    length = np.linalg.norm(rays.directions, axis=1, keepdims=True)
+    depths = _depths(eye, directions, half_side)
+    places = eye + depths[..., None] * directions[:, None]
+    length = np.linalg.norm(directions, axis=1, keepdims=True)
     spacing = float(np.median(length[:, 0] * (depths[:, 1] - depths[:, 0])))
-    votes, tolerant, weights = np.zeros(depths.shape), np.zeros(depths.shape), np.zeros(depths.shape)
-    for neighbor in neighbors:
-        samples = neighbor.image.sample(places)
-        sq_distances = ((samples.colors - rays.blurred[:, None]) ** 2).sum(axis=2)
+    votes, tolerant, weights = np.zeros((3, *depths.shape))
+    of_neighbors = [1.0 / (1.0 + (lapse / SPAN) ** 2) for _, lapse in neighbors]
+    for (neighbor, lapse), weight in zip(neighbors, of_neighbors, strict=True):
+        mask, shown, inside = neighbor.sample(places)
+        sq_distances = ((shown - blurred[:, None]) ** 2).sum(axis=2)
         agreement = 1.0 - COLOR_SHARE + COLOR_SHARE * np.exp(-sq_distances / (2 * COLOR_SPREAD**2))
-        vote = neighbor.weight * samples.mask * agreement
+        vote = weight * mask * agreement
         votes += vote
-        tolerant += _blur_along_rays(vote, neighbor.doubt(eye, half_side) / spacing)
-        weights += neighbor.weight * samples.inside
-    known = np.clip((ALWAYS - always.at(places)) / ALWAYS_WIDTH, 0.0, 1.0) / np.maximum(weights, 1e-6)
-    known[weights < 0.5 * sum(neighbor.weight for neighbor in neighbors)] = 0.0  # hardly seen by others
+        # Standard deviation of the depths at which things seem to be that move while the camera goes to the neighbor.
+        parallax = float(np.linalg.norm(neighbor.camera.position - eye)) / max(float(np.linalg.norm(eye)), 1e-6)
+        tolerant += _blur_along_rays(vote, MOTION * half_side * lapse / max(parallax, 1e-6) / spacing)
+        weights += weight * inside
+    at = np.moveaxis((places / half_side + 1) * 0.5 * GRID - 0.5, -1, 0)
+    share = ndimage.map_coordinates(always, at, order=1, mode="nearest")
+    known = np.clip((ALWAYS - share) / ALWAYS_WIDTH, 0.0, 1.0) / np.maximum(weights, 1e-6)
+    known[weights < 0.5 * sum(of_neighbors)] = 0.0  # hardly seen by others
     scores = votes * known
-    past_middle = (places * rays.directions[:, None]).sum(axis=2) / length
+    past_middle = (places * directions[:, None]).sum(axis=2) / length
     middle = _middle_of_best(tolerant * known * np.exp(-0.5 * (past_middle / (MIDDLE * half_side)) ** 2))
-    row = np.arange(len(scores))
     low = np.floor(middle).astype(np.int64)
-    depth = depths[row, low] + (middle - low) * (depths[:, 1] - depths[:, 0])
-    positions = eye + depth[:, None] * rays.directions
-    kept = scores.max(axis=1) > LEAST_SCORE
-    return Points(positions[kept].astype(np.float32), rays.colors[kept], scores.max(axis=1)[kept].astype(np.float32))
+    depth = depths[np.arange(len(scores)), low] + (middle - low) * (depths[:, 1] - depths[:, 0])
+    positions = eye + depth[:, None] * directions
+    best = scores.max(axis=1)
+    return Points(positions.astype(np.float32), colors, best.astype(np.float32)).chosen(best > LEAST_SCORE)
 
 
 def _blur_along_rays(votes: NDArray[np.floating], spread: float) -> NDArray[np.floating]:
     """Votes (n, DEPTHS) along each ray, blurred by a Gaussian of this standard deviation, in depths."""
-    if spread < 0.1:
-        return votes
     if spread > DEPTHS:
         return np.broadcast_to(votes.mean(axis=1, keepdims=True), votes.shape)
-    return ndimage.gaussian_filter1d(votes, spread, axis=1, mode="nearest", truncate=3.0)
+    return ndimage.gaussian_filter1d(votes, max(spread, 0.1), axis=1, mode="nearest", truncate=3.0)
 
 
 def _depths(eye: Floats, directions: Floats, half_side: float) -> Floats:
@@ -176,29 +176,12 @@ def _dense(points: Points, half_side: float) -> Points:
     return points.chosen(distances[:, 4] < LONELY * half_side)
 
 
-def parts_of(points: Points, link: float, tint: float) -> NDArray[np.int64]:
-    """(n,) number of the connected part of each point, where points closer than `link` are connected. tint: of
-    `PointClouds`."""
-    positions = np.hstack([points.positions, tint * points.colors]) if tint else points.positions
-    pairs, count = cKDTree(positions).query_pairs(link, output_type="ndarray"), len(positions)
-    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    return connected_components(graph, directed=False)[1].astype(np.int64)
-
-
-class _Always:
-    """The share of images in which a place is residual, on a grid over the box."""
-
-    def __init__(self, images: Sequence[Residual], half_side: float) -> None:
-        self._half_side = half_side
-        places = cubic_grid(((np.arange(GRID, dtype=np.float32) + 0.5) / GRID * 2 - 1) * half_side).astype(np.float32)
-        total, count = np.zeros(len(places), np.float32), np.zeros(len(places), np.float32)
-        for image in images:
-            samples = image.sample(places)
-            total += samples.mask
-            count += samples.inside
-        self._share = (total / np.maximum(count, 1.0)).reshape(GRID, GRID, GRID)
-
-    def at(self, points: Floats) -> Floats:
-        """At points (..., 3), interpolated."""
-        index = (points / self._half_side + 1) * 0.5 * GRID - 0.5
-        return ndimage.map_coordinates(self._share, np.moveaxis(index, -1, 0), order=1, mode="nearest")
+def _always(images: Sequence[Residual], half_side: float) -> Floats:
+    """(GRID, GRID, GRID) the share of images in which a place of the box is residual."""
+    places = cubic_grid(((np.arange(GRID, dtype=np.float32) + 0.5) / GRID * 2 - 1) * half_side).astype(np.float32)
+    total, count = np.zeros((2, len(places)), np.float32)
+    for image in images:
+        mask, _, inside = image.sample(places)
+        total += mask
+        count += inside
+    return np.divide(total, np.maximum(count, 1.0), dtype=np.float32).reshape(GRID, GRID, GRID)

@@ -11,12 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from lapgs_wgpu.data.timestamps import time_step
-from lapgs_wgpu.discovery.follower import LEAST_PART, LINK, Follower
+from lapgs_wgpu.discovery.follower import LEAST_PART, Follower
 from lapgs_wgpu.discovery.residual import Floats
-from lapgs_wgpu.discovery.surface_points import PointClouds, Points, merged, parts_of
+from lapgs_wgpu.discovery.surface_points import PointClouds, Points, merged
 from lapgs_wgpu.discovery.trajectories import Trajectory, find_trajectories
 
 KEY_TIMES = 4  # from which is tracked, at most
@@ -55,6 +56,15 @@ class Tracks(NamedTuple):
     paths: Floats
     supported: NDArray[np.bool_]
 
+    @property
+    def parts(self) -> int:
+        """The number of parts."""
+        return int(self.part.max()) + 1
+
+    def center(self, k: int) -> Floats:
+        """(T, 3) the mean of the points of part k."""
+        return self.paths[:, self.part == k].mean(axis=1)
+
     def of_parts(self, kept: NDArray[np.bool_]) -> Tracks | None:
         """The tracks of the parts (p,) that are set, and numbered anew; None where there are none."""
         chosen = kept[self.part]
@@ -76,90 +86,71 @@ def all_of(tracks: Sequence[Tracks]) -> Tracks:
     return Tracks(np.concatenate(positions), np.concatenate(colors), np.concatenate(part), *of_time)
 
 
-def find_tracks(clouds: PointClouds, half_side: float) -> Tracks | None:
-    """Tracks of the surface points of a clip; None where nothing can be followed. half_side: of the box that the
-    points lie in, world units.
+def find_tracks(clouds: PointClouds) -> Tracks | None:
+    """Tracks of the surface points of a clip; None where nothing can be followed.
 
     Many parts are apart where things part, and also where one thing falls to patches. Which it is shows in how close
     to all points the tracks come that start there. Where that is far from all, trajectories that share groups may do
     better.
     """
-    closest, best = -1.0, None
-    for trajectories in find_trajectories(clouds, LINK * half_side, half_side):
+    closest, best = 0.0, None
+    for trajectories in find_trajectories(clouds):
         for many in MANY:
-            tracks = _tracks_by(many, clouds, trajectories, half_side)
-            if (close := _closeness(clouds, tracks, half_side)) > closest:
+            if (tracks := _tracks_by(many, clouds, trajectories)) is None:
+                continue
+            apart = [distances / (CLOSE * clouds.half_side) for distances, _ in clouds.nearest(tracks.paths)]
+            if (close := sum(float(np.exp(-0.5 * each**2).sum()) for each in apart)) > closest:
                 closest, best = close, tracks
         if closest >= FOLLOWED * clouds.total:
             break
     return best
 
 
-def _closeness(clouds: PointClouds, tracks: Tracks | None, half_side: float) -> float:
-    """Of all points, how close they lie to the tracks, from 0 to their number."""
-    if tracks is None:
-        return 0.0
-    return sum(
-        float(np.exp(-0.5 * (_nearest(path, points)[0] / (CLOSE * half_side)) ** 2).sum())
-        for points, path in zip(clouds.clouds, tracks.paths, strict=True)
-    )
-
-
-def _nearest(path: Floats, points: Points) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """(n,) distance of each point to the nearest track at its time, path (m, 3), and the number of that track."""
-    distances, of = cKDTree(path).query(points.positions)
-    return distances, of
-
-
-def _tracks_by(many: float, clouds: PointClouds, trajectories: list[Trajectory], half_side: float) -> Tracks | None:
+def _tracks_by(many: float, clouds: PointClouds, trajectories: list[Trajectory]) -> Tracks | None:
     """The tracks from key times at which as many parts are apart as this quantile of all times has."""
     free = [np.ones(len(cloud.scores), bool) for cloud in clouds.clouds]
     found: list[Tracks] = []
     for _ in range(KEY_TIMES):
         rest = [cloud.chosen(mask) for cloud, mask in zip(clouds.clouds, free, strict=True)]
-        key = _key_time(rest, many, half_side, clouds.tint)
+        key = _key_time(rest, many, clouds)
         if sum(len(points.scores) for points in rest) < LEAST_REST * clouds.total or key is None:
             break
-        weighted = [
+        weighted = tuple(
             points._replace(scores=points.scores * np.where(mask, 1.0, EXPLAINED).astype(np.float32))
             for points, mask in zip(clouds.clouds, free, strict=True)
-        ]
-        followed = _tracks_from(key, _merged(rest, key), clouds.times, weighted, trajectories, half_side, clouds.tint)
+        )
+        followed = _tracks_from(key, _around(rest, key), clouds._replace(clouds=weighted), trajectories)
         if followed is None:
             break
-        if (steady := followed[0].of_parts(_steady(*followed, clouds.clouds, half_side))) is not None:
+        tracks, paths = followed
+        reached = [(distances < REACH * clouds.half_side, of) for distances, of in clouds.nearest(paths)]
+        explained = np.stack([np.bincount(tracks.part[of[near]], minlength=tracks.parts) for near, of in reached])
+        if (steady := tracks.of_parts(_steady(tracks, paths, explained, clouds.half_side))) is not None:
             found.append(steady)
-        for mask, points, path in zip(free, clouds.clouds, followed[1], strict=True):
-            mask &= _nearest(path, points)[0] >= REACH * half_side
+        for mask, (near, _) in zip(free, reached, strict=True):
+            mask &= ~near
     if not found:
         return None
-    offsets = np.cumsum([0, *(tracks.part.max() + 1 for tracks in found[:-1])])
+    offsets = np.cumsum([0, *(tracks.parts for tracks in found[:-1])])
     return all_of([each._replace(part=each.part + offset) for each, offset in zip(found, offsets, strict=True)])
 
 
-def _key_time(clouds: list[Points], many: float, half_side: float, tint: float) -> int | None:
-    """The time of most points among those at which many parts are apart."""
-    some = [points.thinned(PROBES) for points in clouds]
-    parts = np.array([_count_parts(_merged(some, i), half_side, tint) for i in range(len(clouds))])
+def _key_time(rest: list[Points], many: float, clouds: PointClouds) -> int | None:
+    """The time of most of the points that are left among those at which many parts are apart."""
+    some = [points.thinned(PROBES) for points in rest]
+    sizes = [np.bincount(clouds.parts(_around(some, i)), minlength=1) for i in range(len(some))]
+    parts = np.array([(each >= LEAST_PART).sum() for each in sizes])
     if not parts.any():
         return None
     usual = int(np.quantile(parts[parts > 0], many))
-    mass = np.convolve([points.scores.sum() for points in clouds], np.ones(5), "same")[: len(clouds)]
-    least = np.minimum(parts, np.minimum(np.append(parts[1:], parts[-1]), np.append(parts[0], parts[:-1])))
-    apart = (least >= usual) & (parts <= usual + 1)
+    mass = np.convolve([points.scores.sum() for points in rest], np.ones(5), "same")[: len(rest)]
+    apart = (ndimage.minimum_filter1d(parts, 3, mode="nearest") >= usual) & (parts <= usual + 1)
     return int(np.lexsort((mass, apart))[-1])
 
 
-def _merged(clouds: list[Points], i: int) -> Points:
+def _around(clouds: list[Points], i: int) -> Points:
     """The points of a time and of its neighbours."""
     return merged(clouds[max(0, i - 1) : i + 2])
-
-
-def _count_parts(points: Points, half_side: float, tint: float) -> int:
-    if len(points.scores) < LEAST_PART:
-        return 0
-    sizes = np.bincount(parts_of(points, LINK * half_side, tint))
-    return int((sizes >= LEAST_PART).sum())
 
 
 def _voxels(points: Points, size: float, least: int) -> Points:
@@ -179,59 +170,56 @@ def _voxels(points: Points, size: float, least: int) -> Points:
 
 
 def _tracks_from(
-    key: int,
-    start: Points,
-    times: NDArray[np.float64],
-    clouds: list[Points],
-    trajectories: list[Trajectory],
-    half_side: float,
-    tint: float,
+    key: int, start: Points, clouds: PointClouds, trajectories: list[Trajectory]
 ) -> tuple[Tracks, Floats] | None:
     """The points of a key time, followed twice: first those of that time, then with all that belongs to them.
 
     Returns the tracks, and their paths before these were smoothed, which are nearer to the points of each time.
     """
-    template = _voxels(start, VOXEL * half_side, least=1).thinned(ROUGH)
     found = None
-    for last in (False, True):
-        follower = Follower(template, half_side, tint)
-        if len(follower.positions) == 0:
+    for most, least in (ROUGH, 1), (FINE, 3):
+        if found is not None:
+            start = _at_key_time(key, found[0].paths, clouds)
+        follower = Follower(_voxels(start, VOXEL * clouds.half_side, least).thinned(most), key, clouds, trajectories)
+        part = follower.part
+        if len(part) == 0:
             break
-        paths = follower.follow(key, times, clouds, trajectories)
-        supported = _supported(paths, follower.part, clouds, half_side)
-        smooth = _smoothed(times, paths, supported, follower.part)
-        found = Tracks(follower.positions, follower.colors, follower.part, smooth, supported), paths
-        if not last:
-            template = _at_key_time(key, smooth, clouds, half_side).thinned(FINE)
+        paths = follower.follow()
+        supported = np.zeros(paths.shape[:2], bool)
+        for i, points in enumerate(clouds.clouds):
+            if len(points.scores):
+                near = cKDTree(points.positions).query(paths[i])[0] < REACH * clouds.half_side
+                supported[i] = (np.bincount(part, near) / np.bincount(part))[part] > SUPPORTED
+        smooth = _smoothed(clouds.times, paths, supported, part)
+        found = Tracks(follower.positions, follower.colors, part, smooth, supported), paths
     return found
 
 
-def _supported(paths: Floats, part: NDArray[np.int64], clouds: list[Points], half_side: float) -> NDArray[np.bool_]:
-    """(T, n) whether the surface points of a time agree with a point's part."""
-    supported = np.zeros(paths.shape[:2], bool)
-    for i, points in enumerate(clouds):
-        if len(points.scores):
-            near = cKDTree(points.positions).query(paths[i])[0] < REACH * half_side
-            supported[i] = (np.bincount(part, near) / np.bincount(part))[part] > SUPPORTED
-    return supported
+def _at_key_time(key: int, paths: Floats, clouds: PointClouds) -> Points:
+    """All points of the clip that tracks (T, n, 3) explain, moved with them to the key time."""
+    moved = []
+    for points, path, (distances, of) in zip(clouds.clouds, paths, clouds.nearest(paths), strict=True):
+        near = distances < REACH * clouds.half_side
+        positions = points.positions[near] + (paths[key] - path)[of[near]]
+        moved.append(points.chosen(near)._replace(positions=positions))
+    return merged(moved)
 
 
-def _steady(tracks: Tracks, paths: Floats, clouds: Sequence[Points], half_side: float) -> NDArray[np.bool_]:
+def _steady(tracks: Tracks, paths: Floats, explained: NDArray[np.int64], half_side: float) -> NDArray[np.bool_]:
     """(p,) bool: parts that are visible long enough and do not jump between objects.
 
     Patches that the static fit only blurs come and go, and a part that follows them leaps from one to the next. A part
     is one object if it stands still, moves more than it jitters, or explains as many points at one time as at another.
-    paths: (T, n, 3), before they were smoothed.
+    paths: (T, n, 3), before they were smoothed. explained: (T, p) how many points of a time each part explains.
     """
-    explained = _explained(paths, tracks.part, clouds, half_side)
-    steady = np.zeros(explained.shape[1], bool)
+    steady = np.zeros(tracks.parts, bool)
     for k in range(len(steady)):
         members = tracks.part == k
         seen = tracks.supported[:, members][:, 0]
         visits = np.count_nonzero(np.diff(seen, prepend=False) & seen)
         if seen.mean() < (LEAST_VISIT if visits == 1 else LEAST_SEEN):
             continue
-        center = tracks.paths[:, members].mean(axis=1)
+        center = tracks.center(k)
         jitter = np.linalg.norm(paths[:, members].mean(axis=1) - center, axis=1)[seen].mean()
         steps = np.linalg.norm(np.diff(center, axis=0), axis=1)[seen[1:] & seen[:-1]]
         step = np.median(steps) if len(steps) else 0.0
@@ -241,15 +229,6 @@ def _steady(tracks: Tracks, paths: Floats, clouds: Sequence[Points], half_side: 
         leaps = LEAP_SIZE * size if even else min(LEAPS * step, LEAP_SIZE * size)
         steady[k] = still or jitter < max(leaps, CALM * half_side)
     return steady
-
-
-def _explained(paths: Floats, part: NDArray[np.int64], clouds: Sequence[Points], half_side: float) -> NDArray[np.int64]:
-    """(T, p) how many of the points of a time each part is the nearest to, and explains."""
-    counts = np.zeros((len(paths), int(part.max()) + 1), np.int64)
-    for count, path, points in zip(counts, paths, clouds, strict=True):
-        distances, of = _nearest(path, points)
-        count += np.bincount(part[of[distances < REACH * half_side]], minlength=len(count))
-    return counts
 
 
 def parabolas(times: NDArray[np.float64], weights: NDArray[np.float64], spread: float) -> NDArray[np.floating]:
@@ -273,14 +252,3 @@ def _smoothed(
         weights = np.where(supported[:, members][:, 0], 1.0, UNSUPPORTED)
         smooth[:, members] = np.tensordot(parabolas(times, weights, SMOOTHING), paths[:, members], axes=1)
     return smooth
-
-
-def _at_key_time(key: int, paths: Floats, clouds: list[Points], half_side: float) -> Points:
-    """All points of the clip that a track (paths: (T, n, 3)) explains, moved with it to the key time."""
-    parts = []
-    for points, path in zip(clouds, paths, strict=True):
-        distances, of = _nearest(path, points)
-        near = distances < REACH * half_side
-        moved = points.positions[near] + (paths[key] - path)[of[near]]
-        parts.append(points.chosen(near)._replace(positions=moved))
-    return _voxels(merged(parts), VOXEL * half_side, least=3)

@@ -12,17 +12,17 @@ they bend least; so do all across a gap between the images, in which things may 
 
 from __future__ import annotations
 
-from functools import partial
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter1d
 from scipy.optimize import linear_sum_assignment
 
 from lapgs_wgpu.data.timestamps import time_step
 from lapgs_wgpu.discovery.residual import Floats
-from lapgs_wgpu.discovery.surface_points import PointClouds, parts_of
+from lapgs_wgpu.discovery.surface_points import PointClouds
 
 LEAST_GROUP = 6  # points
 FULL_GROUP = 20  # points, from which on a group counts in full
@@ -53,110 +53,101 @@ class Trajectory(NamedTuple):
 class _Groups(NamedTuple):
     """The groups of all times.
 
-    time: (n,) index. clock: (n,) time in typical time steps. centers, colors: (n, 3). worth: (n,) in [0, 1].
+    clock: (T,) all times, in typical time steps. half_side: of the box. Of each group time: (n,) its index. centers,
+    colors: (n, 3). worth: (n,) in [0, 1].
     """
 
-    time: NDArray[np.int64]
     clock: NDArray[np.float64]
+    half_side: float
+    time: NDArray[np.int64]
     centers: NDArray[np.float64]
     colors: NDArray[np.float64]
     worth: NDArray[np.float64]
 
 
-def find_trajectories(clouds: PointClouds, link: float, half_side: float) -> list[list[Trajectory]]:
+def find_trajectories(clouds: PointClouds) -> list[list[Trajectory]]:
     """Trajectories of what the surface points show, those that explain most first: one to one, and then as they were
-    found, where that differs.
-
-    link: distance of points of one group. half_side: of the box that they lie in. Both in world units.
-    """
-    clock = clouds.times / time_step(clouds.times)
-    groups = _groups(clouds, clock, link)
+    found, where that differs."""
+    groups = _groups(clouds)
     paths: list[list[int]] = []
     while len(paths) < MOST:
-        path, worth = _best_path(groups, len(clouds.times), half_side)
+        path, worth = _best_path(groups)
         if worth < LEAST_WORTH:
             break
         groups.worth[path] *= AGAIN
         paths.append(path)
-    at_once = int(np.quantile(np.bincount(groups.time, minlength=len(clock)), AT_ONCE))
-    given = _one_to_one(groups, paths[:at_once], clock, half_side) + paths[at_once:]
-    return [
-        [_smooth(groups, path, clock, bent=True) for path in each]
-        for each in ([given] if given == paths else [given, paths])
-    ]
+    at_once = int(np.quantile(np.bincount(groups.time, minlength=len(groups.clock)), AT_ONCE))
+    given = _one_to_one(groups, paths[:at_once]) + paths[at_once:]
+
+    def trajectory(path: list[int]) -> Trajectory:
+        seen = np.isin(np.arange(len(groups.clock)), groups.time[path])
+        return Trajectory(_smooth(groups, path, bent=True), seen)
+
+    return [[trajectory(path) for path in each] for each in ([given] if given == paths else [given, paths])]
 
 
-def _groups(clouds: PointClouds, clock: NDArray[np.float64], link: float) -> _Groups:
+def _groups(clouds: PointClouds) -> _Groups:
     rows = []
     for i, points in enumerate(clouds.clouds):
-        part = parts_of(points, link, clouds.tint)
+        part = clouds.parts(points)
         for k in np.flatnonzero(np.bincount(part, minlength=1) >= LEAST_GROUP):
             members = part == k
             center, color = points.positions[members].mean(axis=0), points.colors[members].mean(axis=0)
             rows.append([i, *center, *color, min(1.0, members.sum() / FULL_GROUP)])
     table = np.array(rows, np.float64).reshape(-1, 8)
-    time = table[:, 0].astype(np.int64)
-    return _Groups(time, clock[time], table[:, 1:4], table[:, 4:7], table[:, 7].copy())
+    of_groups = table[:, 0].astype(np.int64), table[:, 1:4], table[:, 4:7], table[:, 7].copy()
+    return _Groups(clouds.times / time_step(clouds.times), clouds.half_side, *of_groups)
 
 
-def _best_path(groups: _Groups, times: int, half_side: float) -> tuple[list[int], float]:
+def _best_path(groups: _Groups) -> tuple[list[int], float]:
     """The groups on the path of the highest worth, in the order of time, and that worth.
 
     A state is a step from one group to another; what it is worth depends on the steps that end where it starts.
     """
-    first = np.searchsorted(groups.time, np.arange(times + LEAP + 1))
-    # The steps that end in a group: the groups that they start from, their velocities and worths, and which step of
-    # their start they go on from (-1: none).
-    starts: list[NDArray[np.int64]] = []
-    velocities: list[NDArray[np.float64]] = []
-    worths: list[NDArray[np.float64]] = []
-    before: list[NDArray[np.int64]] = []
+    clock, half_side = groups.clock[groups.time], groups.half_side
+    first = np.searchsorted(groups.time, np.arange(len(groups.clock)))
+    # Of the steps that end in each group: the groups that they start from, their velocities and worths, and which step
+    # of their start they go on from (-1: none).
+    steps: list[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]] = []
     for b, (time, center, color) in enumerate(zip(groups.time, groups.centers, groups.colors, strict=True)):
         a = np.arange(first[max(0, time - LEAP)], first[time])
-        lapse = groups.clock[b] - groups.clock[a]
-        velocity = (center - groups.centers[a]) / lapse[:, None]
+        velocity = (center - groups.centers[a]) / (clock[b] - clock[a])[:, None]
         near = np.abs(velocity).max(axis=1, initial=0.0) <= STEP * half_side
-        a, lapse, velocity = a[near], lapse[near], velocity[near]
+        a, velocity = a[near], velocity[near]
         change = ((color - groups.colors[a]) ** 2).sum(axis=1) / (2 * COLOR_SPREAD**2)
         gain = groups.worth[b] - SKIPPED * (time - groups.time[a] - 1) - np.minimum(SHARP, change)
         worth, origin = groups.worth[a], np.full(len(a), -1)
         for i, group in enumerate(a):
-            if len(starts[group]):
-                bend = ((velocity[i] - velocities[group]) ** 2).sum(axis=1) / (2 * (BEND * half_side) ** 2)
-                totals = worths[group] - np.minimum(SHARP, bend)
-                best = int(totals.argmax())
-                if totals[best] > worth[i]:
-                    worth[i], origin[i] = totals[best], best
-        starts.append(a)
-        velocities.append(velocity)
-        worths.append(worth + gain)
-        before.append(origin)
-    totals = np.array([worth.max(initial=0.0) for worth in worths])
+            _, velocities, worths, _ = steps[group]
+            bend = ((velocity[i] - velocities) ** 2).sum(axis=1) / (2 * (BEND * half_side) ** 2)
+            totals = worths - np.minimum(SHARP, bend)
+            if totals.max(initial=-np.inf) > worth[i]:
+                worth[i], origin[i] = totals.max(), totals.argmax()
+        steps.append((a, velocity, worth + gain, origin))
+    totals = np.array([worths.max(initial=0.0) for _, _, worths, _ in steps])
     if not totals.any():
         return [], 0.0
     group = int(totals.argmax())
-    step = int(worths[group].argmax())
-    total, path = float(totals[group]), [group]
+    step, path = int(steps[group][2].argmax()), [group]
     while step >= 0:
-        group, step = int(starts[group][step]), int(before[group][step])
+        starts, _, _, before = steps[group]
+        group, step = int(starts[step]), int(before[step])
         path.append(group)
-    return path[::-1], total
+    return path[::-1], float(totals.max())
 
 
-def _one_to_one(
-    groups: _Groups, paths: list[list[int]], clock: NDArray[np.float64], half_side: float
-) -> list[list[int]]:
+def _one_to_one(groups: _Groups, paths: list[list[int]]) -> list[list[int]]:
     """The paths, to which the groups of each time are given all at once, each to one (the Hungarian method)."""
     if len(paths) < 2:
         return paths
     for reach in REACHES:
-        _uncross(groups, paths, clock, half_side)
-        centers = np.stack([_smooth(groups, path, clock, alone=True).centers for path in paths])
+        _uncross(groups, paths)
+        centers = np.stack([_smooth(groups, path, alone=True) for path in paths])
         colors = np.stack([np.median(groups.colors[path], axis=0) for path in paths])
         given: list[list[int]] = [[] for _ in paths]
-        for i in range(len(clock)):
+        for i in range(len(groups.clock)):
             here = np.flatnonzero(groups.time == i)
-            away = np.linalg.norm(centers[:, i, None] - groups.centers[here], axis=2) / (reach * half_side)
+            away = np.linalg.norm(centers[:, i, None] - groups.centers[here], axis=2) / (reach * groups.half_side)
             change = ((colors[:, None] - groups.colors[here]) ** 2).sum(axis=2) / (2 * COLOR_SPREAD**2)
             cost = away**2 + 0.5 * np.minimum(SHARP, change)
             for row, column in zip(*linear_sum_assignment(np.minimum(cost, 4.0)), strict=True):
@@ -166,36 +157,31 @@ def _one_to_one(
     return paths
 
 
-def _uncross(groups: _Groups, paths: list[list[int]], clock: NDArray[np.float64], half_side: float) -> None:
+def _uncross(groups: _Groups, paths: list[list[int]]) -> None:
     """Exchange the ends of two paths behind a meeting or a gap, where both then bend less and keep their colors."""
+    gaps = np.diff(groups.clock) > MEET_GAP
     for a, b in combinations(range(len(paths)), 2):
-        apart = np.linalg.norm(
-            _smooth(groups, paths[a], clock).centers - _smooth(groups, paths[b], clock).centers, axis=1
-        )
-        meetings = [
-            i
-            for i in range(1, len(clock) - 1)
-            if (apart[i] < MEETING * half_side and apart[i] == apart[max(0, i - MEET_TIMES) : i + MEET_TIMES + 1].min())
-            or clock[i + 1] - clock[i] > MEET_GAP
-        ]
-        for i in meetings:
+        apart = np.linalg.norm(_smooth(groups, paths[a]) - _smooth(groups, paths[b]), axis=1)
+        least = minimum_filter1d(apart, 2 * MEET_TIMES + 1, mode="nearest")
+        meet = (apart < MEETING * groups.half_side) & (apart == least)
+        for i in (1 + np.flatnonzero(meet[1:-1] | gaps[1:])).tolist():
             before = [[g for g in paths[n] if groups.time[g] <= i] for n in (a, b)]
             after = [[g for g in paths[n] if groups.time[g] > i] for n in (a, b)]
-            bends, changes = (
-                [sum(of(one, other) for one, other in zip(before, ends, strict=True)) for ends in (after, after[::-1])]
-                for of in (partial(_bend, groups, clock, i), partial(_change, groups))
-            )
+            both = list(zip(before, after, strict=True)), list(zip(before, after[::-1], strict=True))
+            bends = [sum(_bend(groups, i, *path) for path in each) for each in both]
+            changes = [sum(_change(groups, *path) for path in each) for each in both]
             better = bends[1] < bends[0] and changes[1] < changes[0] + COLOR_SPREAD
-            if better and min(len(before[0] + after[1]), len(before[1] + after[0])) >= LEAST_WORTH:
-                paths[a], paths[b] = before[0] + after[1], before[1] + after[0]
+            crossed = [one + other for one, other in both[1]]
+            if better and min(len(path) for path in crossed) >= LEAST_WORTH:
+                paths[a], paths[b] = crossed
 
 
-def _bend(groups: _Groups, clock: NDArray[np.float64], at: int, before: list[int], after: list[int]) -> float:
+def _bend(groups: _Groups, at: int, before: list[int], after: list[int]) -> float:
     """Squared distances from a parabola of the groups of a path at the times shortly before and after one."""
     around = [g for g in before + after if MEET_GAP < abs(groups.time[g] - at) <= MEET_GAP + MEET_TIMES]
     if len(around) < 6:
         return 0.0
-    basis = np.vander((groups.clock[around] - clock[at]) / MEET_TIMES, 3)
+    basis = np.vander((groups.clock[groups.time[around]] - groups.clock[at]) / MEET_TIMES, 3)
     fitted = basis @ np.linalg.lstsq(basis, groups.centers[around], rcond=None)[0]
     return float(np.square(groups.centers[around] - fitted).sum())
 
@@ -207,26 +193,22 @@ def _change(groups: _Groups, before: list[int], after: list[int]) -> float:
     return float(np.linalg.norm(np.median(groups.colors[before], axis=0) - np.median(groups.colors[after], axis=0)))
 
 
-def _smooth(
-    groups: _Groups, path: list[int], clock: NDArray[np.float64], *, alone: bool = False, bent: bool = False
-) -> Trajectory:
-    """The path at every time (T,): a straight line fitted to the groups around it, by weights that fall off in time.
+def _smooth(groups: _Groups, path: list[int], *, alone: bool = False, bent: bool = False) -> Floats:
+    """(T, 3) the path at every time: a straight line fitted to the groups around it, by weights that fall off in time.
 
     alone: whether by those of other times alone. bent: whether a parabola where it leaps over times, in which what
     circles turns."""
     centers = groups.centers[path]
-    lapses = groups.clock[path] - clock[:, None]
-    counted = lapses != 0 if alone else np.full(lapses.shape, fill_value=True)
+    lapses = groups.clock[groups.time[path]] - groups.clock[:, None]
+    counted = (lapses != 0) | (not alone)
     nearest = np.where(counted, np.abs(lapses), np.inf).min(axis=1)[:, None]
     leapt = bent & (nearest > 0) & (lapses[:, :1] < 0) & (lapses[:, -1:] > 0)
     weights = counted * np.exp(-0.5 * (lapses / (WINDOW + np.where(leapt, 0.5, 1.0) * nearest)) ** 2)
-    result = np.zeros((len(clock), 3), np.float32)
+    result = np.zeros((len(lapses), 3), np.float32)
     for i, (weight, lapse) in enumerate(zip(weights, lapses, strict=True)):
         basis = np.vander(lapse, 3 if leapt[i, 0] else 2, increasing=True)
         product = basis.T * weight
         # Beyond its ends a path hardly goes on.
         ridge = np.diag([0.0, 1e-3, 1e-2] if leapt[i, 0] else [0.0, 1e-3 + nearest[i, 0]])
         result[i] = np.linalg.solve(product @ basis + ridge, product @ centers)[0]
-    seen = np.zeros(len(clock), bool)
-    seen[groups.time[path]] = True
-    return Trajectory(result, seen)
+    return result

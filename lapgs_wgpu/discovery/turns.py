@@ -42,6 +42,7 @@ FASTEST = 36.0  # degrees a time step
 # and how many turns the next one looks around.
 SEARCHES = (8.0, 3, 12), (4.0, 5, 4), (2.0, 8, 1)
 CELL, FINE = 0.18, 0.12  # radii; size of the places at which colors are compared, in the search and from there on
+SIDE = int(2 / FINE) + 3  # of these along an axis
 BLUR = 1.0  # FINE; standard deviation of the weights by which the colors around a place tell its color
 KEPT = 5  # time steps from the key time, up to which its turn is kept
 AROUND = (6.0, 2), (2.0, 2), (1.0, 1)  # degrees of a step and number of steps, of the search for the turn of a time
@@ -76,7 +77,7 @@ def find_turns(
 ) -> tuple[NDArray[np.int64], dict[int, Doubles]]:
     """(p,) which part stands for each, since several may be one thing; and by the number of each of these that turns
     its rotations (T, 3, 3) at the times (T,), from whatever orientation."""
-    centers = [tracks.paths[:, tracks.part == k].mean(axis=1) for k in range(int(tracks.part.max()) + 1)]
+    centers = [tracks.center(k) for k in range(tracks.parts)]
     radii = np.array([part_radius(tracks, k) for k in range(len(centers))])
     stands = _one_of_each(centers, radii)
     things = np.unique(stands)
@@ -90,13 +91,13 @@ def find_turns(
         if sum(len(look.places) > 0 for look in looks) < LEAST_TIMES:
             continue
         R = _smoothed(_turns(looks, clock), clock, near)
-        R = _smoothed(_fitted_again(looks, R), clock, near)
-        colors = np.concatenate([look.colors for look in looks])
-        turned, still = (
-            _explained(np.concatenate([look.places @ each for look, each in zip(looks, S, strict=True)]), colors)
-            for S in (R, [np.eye(3)] * len(R))
-        )
-        if turned - still >= GAIN * (1.0 - still):
+        known = _known(looks, R)
+        again = [_turn_of(look, each, known - _known([look], each[None])) for look, each in zip(looks, R, strict=True)]
+        R = _smoothed(np.stack(again), clock, near)
+        places, colors = (np.concatenate(each) for each in zip(*looks, strict=True))
+        still = _explained(places, colors)
+        turned = np.concatenate([look.places @ each for look, each in zip(looks, R, strict=True)])
+        if _explained(turned, colors) - still >= GAIN * (1.0 - still):
             found[k] = R
     return stands, found
 
@@ -147,8 +148,9 @@ def _looks(k: int, times: Doubles, centers: Floats, radii: Doubles, images: Sequ
     others = np.arange(len(radii)) != k
     for image in images:
         at = int(np.searchsorted(times, image.time))
-        rays, to = image.rays(PIXELS), centers[at] - image.camera.position
-        d = rays.directions / np.linalg.norm(rays.directions, axis=1, keepdims=True)
+        directions, _, colors = image.rays(PIXELS)
+        d = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        to = centers[at] - image.camera.position
         along = d @ to.T
         beside = (to**2).sum(axis=1) - along**2  # (n, p) squared distances of rays and centers
         hidden = (beside[:, others] < (OVERLAP * radii[others]) ** 2).any(axis=1)
@@ -157,14 +159,14 @@ def _looks(k: int, times: Doubles, centers: Floats, radii: Doubles, images: Sequ
             continue
         chosen = chosen[evenly_indices(len(chosen), SAMPLES)]
         distances = along[chosen, k] - np.sqrt(radii[k] ** 2 - np.maximum(beside[chosen, k], 0.0))
-        found[at].append(_Look((distances[:, None] * d[chosen] - to[k]) / radii[k], rays.colors[chosen]))
+        found[at].append(_Look((distances[:, None] * d[chosen] - to[k]) / radii[k], colors[chosen]))
     return _unlit([_Look(*map(np.concatenate, zip(*each, strict=True))) for each in found])
 
 
 def _unlit(looks: list[_Look]) -> list[_Look]:
     """The colors without the light, which does not turn with a part."""
-    basis = np.stack(harmonics(*np.concatenate([look.places for look in looks]).T), axis=1)
-    bright = np.concatenate([look.colors for look in looks]).mean(axis=1)
+    places, colors = (np.concatenate(each) for each in zip(*looks, strict=True))
+    basis, bright = np.stack(harmonics(*places.T), axis=1), colors.mean(axis=1)
     H = basis.T @ basis
     light = np.linalg.solve(H + 1e-3 * (np.trace(H) + 1) / 9 * np.eye(9), basis.T @ bright)
     least = DARK * float(bright.mean()) if len(bright) else 1.0
@@ -174,11 +176,10 @@ def _unlit(looks: list[_Look]) -> list[_Look]:
     ]
 
 
-def _cells(places: Doubles, size: float) -> tuple[NDArray[np.int64], int]:
-    """(...) numbers of the cells of a cubic grid in which places (..., 3) lie, and how many it has along an axis."""
-    side = int(2 / size) + 3
-    index = np.floor(places / size).astype(np.int64) + side // 2
-    return (index[..., 0] * side + index[..., 1]) * side + index[..., 2], side
+def _cells(places: Doubles, size: float) -> NDArray[np.int64]:
+    """(...) numbers of the cells of this size, of a cubic grid of SIDE^3, in which places (..., 3) lie."""
+    index = np.floor(places / size).astype(np.int64) + SIDE // 2
+    return (index[..., 0] * SIDE + index[..., 1]) * SIDE + index[..., 2]
 
 
 def _explained(places: Doubles, colors: Floats, blocks: NDArray[np.int64] | int = 0) -> float:
@@ -186,8 +187,7 @@ def _explained(places: Doubles, colors: Floats, blocks: NDArray[np.int64] | int 
     blocks: (n,) from 0; only places of one block are compared."""
     if len(colors) < 2:
         return 0.0
-    cells, side = _cells(places, CELL)
-    cells += blocks * side**3
+    cells = _cells(places, CELL) + blocks * SIDE**3
     counts = np.bincount(cells)
     used = np.flatnonzero(counts)
     rest = float(np.square(colors).sum())
@@ -213,19 +213,16 @@ def _turn_at(looks: list[_Look], clock: Doubles, key: int) -> tuple[Doubles, flo
             values.append(_explained(np.einsum("ni,nij->nj", places, R[of]), colors, (blocks - blocks.min())[of]))
         return np.array(values)
 
-    turns = SEARCHES[0][0] * _grid(int(FASTEST / SEARCHES[0][0]))
+    widest, far = SEARCHES[0][0], FASTEST // SEARCHES[0][0]
+    turns = widest * cubic_grid(np.arange(-far, far + 1.0))
     turns = np.radians(turns[np.linalg.norm(turns, axis=1) <= FASTEST])
     for step, reach, best in SEARCHES:
-        if step < SEARCHES[0][0]:
-            turns = np.unique((turns[:, None] + np.radians(step) * _grid(1)).reshape(-1, 3).round(9), axis=0)
+        if step < widest:
+            around = np.radians(step) * cubic_grid(np.arange(-1.0, 2.0))
+            turns = np.unique((turns[:, None] + around).reshape(-1, 3).round(9), axis=0)
         values = explained(turns, reach)
         turns = turns[np.argsort(-values, kind="stable")[:best]]
     return turns[0], float(values.max() - explained(np.zeros((1, 3)), reach)[0])
-
-
-def _grid(half: int) -> Doubles:
-    """(n, 3) whole numbers from -half to half."""
-    return cubic_grid(np.arange(-half, half + 1.0))
 
 
 def _turns(looks: list[_Look], clock: Doubles) -> Doubles:
@@ -249,20 +246,12 @@ def _turns(looks: list[_Look], clock: Doubles) -> Doubles:
     return R
 
 
-def _fitted_again(looks: list[_Look], R: Doubles) -> Doubles:
-    """Rotations (T, 3, 3), near the given ones, of which each fits best what all other times show."""
-    known = _known(looks, R)
-    return np.stack(
-        [_turn_of(look, each, known - _known([look], each[None])) for look, each in zip(looks, R, strict=True)]
-    )
-
-
 def _known(looks: list[_Look], R: Doubles) -> Doubles:
-    """(4, n, n, n) what times of rotations R (T, 3, 3) show of a ball's places of size FINE: number of samples, and
-    sums of their colors."""
-    sums = np.zeros((4, *[_cells(np.zeros(3), FINE)[1]] * 3))
+    """(4, SIDE, SIDE, SIDE) number of samples, and sums of their colors, that times of rotations R (T, 3, 3) show of a
+    ball's places of size FINE."""
+    sums = np.zeros((4, SIDE, SIDE, SIDE))
     for look, turn in zip(looks, R, strict=True):
-        cells, _ = _cells(look.places @ turn, FINE)
+        cells = _cells(look.places @ turn, FINE)
         for each, values in zip(sums, [None, *look.colors.T], strict=True):
             each += np.bincount(cells, values, each.size).reshape(each.shape)
     return sums
@@ -279,8 +268,8 @@ def _turn_of(look: _Look, expected: Doubles, sums: Doubles) -> Doubles:
     variance = max(float(look.colors.var(axis=0).sum()), 1e-6)
     best = expected
     for step, half in AROUND:
-        R = Rotation.from_rotvec(np.radians(step) * _grid(half)).as_matrix() @ best
-        cells, _ = _cells(np.einsum("nj,hjk->hnk", look.places, R), FINE)
+        R = Rotation.from_rotvec(np.radians(step) * cubic_grid(np.arange(-half, half + 1.0))).as_matrix() @ best
+        cells = _cells(np.einsum("nj,hjk->hnk", look.places, R), FINE)
         errors = np.square(known[cells] - look.colors).sum(axis=2).mean(axis=1) / variance
         away = np.degrees(Rotation.from_matrix(R @ expected.T).magnitude())
         best = R[int((errors + (away / AS_BEFORE) ** 2).argmin())]

@@ -6,8 +6,6 @@ Laurentini, The visual hull concept for silhouette-based image understanding (PA
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -29,14 +27,6 @@ TINT = 1.0  # box half sides: hands that hold a ball are not of one color with i
 BLACK = 0.0, 0.0, 0.0
 
 
-class _StillCamera(NamedTuple):
-    """views: small ones, by time. usual: (h, w, 3). pixel: (n,) that shows each place, -1 where none does."""
-
-    views: dict[float, View]
-    usual: NDArray[np.float32]
-    pixel: NDArray[np.int32]
-
-
 def hull_points(dataset: Dataset, half_side: float) -> PointClouds:
     """Points of what moves within [-half_side, half_side]^3, for each time of a rig's clip. Raises InputError where an
     image cannot be read."""
@@ -48,16 +38,16 @@ def hull_points(dataset: Dataset, half_side: float) -> PointClouds:
     for time in counted(dataset.times, len(dataset.times), "times searched for what moves"):
         seeing, agreeing = np.zeros((2, len(places)), np.int32)
         shown = []
-        for camera in cameras:
-            if (view := camera.views.get(float(time))) is None:
+        for views, usual, pixel in cameras:
+            if (view := views.get(float(time))) is None:
                 continue
             image = composite(view.load(), BLACK)
-            differs = ndimage.uniform_filter(np.abs(image - camera.usual).mean(axis=2), 3) > DIFFERENT
+            differs = ndimage.uniform_filter(np.abs(image - usual).mean(axis=2), 3) > DIFFERENT
             if differs.mean() > WHOLE:
                 continue
-            shown.append((image, differs, camera.pixel))
-            seeing += camera.pixel >= 0
-            agreeing += _at(ndimage.binary_dilation(differs), camera.pixel)
+            shown.append((image, differs, pixel))
+            seeing += pixel >= 0
+            agreeing += _at(ndimage.binary_dilation(differs), pixel)
         there = np.flatnonzero((seeing >= AROUND) & (agreeing >= AGREEING * seeing))
         there = there[evenly_indices(len(there), POINTS)]
         colors = np.full((len(shown), len(there), 3), np.nan, np.float32)
@@ -67,17 +57,20 @@ def hull_points(dataset: Dataset, half_side: float) -> PointClouds:
         known = np.isfinite(colors).any(axis=(0, 2))
         color = np.nanmedian(colors[:, known], axis=0)  # in some cameras something else is before it
         clouds.append(Points(places[there[known]].astype(np.float32), color, np.ones(len(color), np.float32)))
-    return PointClouds(dataset.times, tuple(clouds), TINT * half_side)
+    return PointClouds(dataset.times, tuple(clouds), half_side, TINT * half_side)
 
 
-def _still_camera(views: list[View], places: NDArray[np.float32]) -> _StillCamera:
+def _still_camera(
+    views: list[View], places: NDArray[np.float32]
+) -> tuple[dict[float, View], NDArray[np.float32], NDArray[np.int32]]:
+    """Small views, by time; their usual image (h, w, 3); and the pixel (n,) that shows each place, -1 where none."""
     small = sorted(small_views(views, SIDE), key=lambda view: view.time)
     usual = np.median([composite(view.load(), BLACK) for view in evenly(small, IMAGES)], axis=0).astype(np.float32)
     camera = small[0].camera
     pixels, depths = camera.project(places)
     inside = (depths > 1e-9) & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
     column, row = np.where(inside[:, None], pixels, 0).astype(np.int32).T
-    return _StillCamera({view.time: view for view in small}, usual, np.where(inside, row * camera.width + column, -1))
+    return {view.time: view for view in small}, usual, np.where(inside, row * camera.width + column, -1)
 
 
 def _at(mask: Mask, pixel: NDArray[np.int32]) -> Mask:
