@@ -154,8 +154,8 @@ def test_calibrations(form: str, tmp_path: Path) -> None:
     [
         ("none.toml", None, "does not exist"),
         ("a.txt", "hello", "known format"),
-        ("a.qca.txt", "<a><camera/></a>", "transform.x"),
-        ("a.qca.txt", "<a>", "XML"),
+        ("a.qca.txt", "<a><camera/></a>", "focalLengthU"),
+        ("a.qca.txt", "<a>", "cannot be read"),
         ("intri.yml", "%YAML:1.0\n" + opencv("K_1", np.eye(3)), "T_1"),
     ],
 )

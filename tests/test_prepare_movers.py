@@ -15,7 +15,8 @@ from lapgs_wgpu.data.images import encode_png
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.capture import prepare
 from lapgs_wgpu.prepare.flow import Motion
-from lapgs_wgpu.prepare.movers import RIM, Judged, depth_errors, in_mask, read_masks, without
+from lapgs_wgpu.prepare.movers import RIM, Judged, depth_errors, read_masks
+from lapgs_wgpu.prepare.poses import in_mask, without
 
 pycolmap = pytest.importorskip("pycolmap")
 pytest.importorskip("av")
@@ -165,18 +166,17 @@ def test_matches_without_masked_features() -> None:
     size = (320, 240)
     places = np.array([[160.0, 120.0], [5.0, 5.0], [319.9, 239.9]])
     assert in_mask(mask, places, size).tolist() == [True, False, False]
-    assert in_mask(None, places, size).tolist() == [False] * 3
     matches = {("a", "b"): np.array([[0, 1], [1, 1], [2, 0]])}
-    found = without(matches, {"a": places, "b": places}, {"a": mask}, size)
+    found = without(matches, {"a": places, "b": places}, {"a": mask, "b": np.zeros((1, 1), bool)}, size)
     assert found["a", "b"].tolist() == [[1, 1], [2, 0]]
 
 
 def test_cameras_that_follow_what_moves_in_a_part_of_the_film() -> None:
     """In the first image they fit its left quarter alone, in the second all but that: both see it move."""
     moves = np.tile(np.arange(12) < 3, (9, 1))
-    errors = [np.where(moves, 1.0, 8.0).astype(np.float32), np.where(moves, 20.0, 1.0).astype(np.float32)]
-    wrong = Judged(["a", "b"], errors, [np.log(each) for each in errors], float(np.log(5)), 0.3)
-    right = wrong._replace(errors=errors[1:] * 2)
+    errors = np.stack([np.where(moves, 1.0, 8.0), np.where(moves, 20.0, 1.0)]).astype(np.float32)
+    wrong = Judged(["a", "b"], errors, np.log(errors), float(np.log(5)), 0.3)
+    right = wrong._replace(errors=errors[[1, 1]])
     assert (wrong.contradicted(), right.contradicted()) == (["a"], [])
     assert right.explained(wrong) == pytest.approx(1.5)
     wider = [mask.mean() for mask in wrong.rough(turned_over=True).values()]

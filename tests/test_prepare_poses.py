@@ -119,8 +119,8 @@ def test_what_a_hand_does_not_do() -> None:
 def test_the_part_that_fits() -> None:
     names = [f"{i}" for i in range(20)]
     placed = [f"{i}" for i in (0, 1, 2, 8, 9, 11, 12, 14, 19)]
-    assert longest_part(names, placed, 2) == ("8", "9", "11", "12", "14")
-    assert longest_part(names, names, 0) == tuple(names)
+    assert longest_part(names, placed) == ["8", "9", "11", "12", "14"]
+    assert longest_part(names, names) == names
 
 
 def test_nearest_descriptors() -> None:

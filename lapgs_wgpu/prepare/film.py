@@ -63,8 +63,6 @@ class Film:
         """Read the header. Raises InputError."""
         self.path = path
         self.notes: list[str] = []
-        if not path.is_file():
-            raise InputError(f"{path} does not exist; check its name, and the folder {path.parent.resolve()}.")
         with opened_film(path) as (file, stream):
             self._aspect = pixel_aspect(stream)
             length = stream.duration and stream.time_base and stream.duration * stream.time_base
@@ -77,7 +75,7 @@ class Film:
         """Decode the frames in the order of their times. Raises InputError; a film that is damaged after its first
         frames ends there, with a note."""
         av = import_av(self.path)
-        number, first, last, guessed, rate, begin = 0, 0.0, -1.0, False, self.rate, None
+        number, first, last, begin, guessed, damaged = 0, 0.0, -1.0, None, False, False
         with opened_film(self.path) as (file, stream):
             try:
                 for frame in file.decode(stream):
@@ -95,33 +93,28 @@ class Film:
                         )
                     seconds = -1.0 if frame.time is None else frame.time - first
                     if number and seconds <= last:  # no time stamp, or one that was there before
-                        guessed, seconds = True, last + 1 / rate
+                        guessed, seconds = True, last + 1 / self.rate
                     seconds = max(seconds, 0.0)
-                    if seconds >= self.start - 0.5 / rate:
+                    if seconds >= self.start - 0.5 / self.rate:
                         begin = seconds if begin is None else begin
                         yield Frame(seconds - begin, _gray(frame, shown, shape), partial(_pixels, frame, shown, shape))
                     number, last = number + 1, seconds
-            except av.error.FFmpegError as error:
+            except av.error.FFmpegError:
                 if number < 2:
                     raise
-                self.notes.append(
-                    f"{self.path} is damaged after {number} frames, at {last:.2f} s ({error}); what comes before is "
-                    "used."
-                )
+                damaged = True
         if number < 2:
             raise InputError(
                 f"{self.path} has {number} frames that can be decoded, and 2 are needed at least; give the recording "
                 "itself, not its preview or a single picture."
             )
-        if self.seconds > last + max(3 / rate, 0.1 * self.seconds):
-            self.notes.append(
-                f"{self.path} states {self.seconds:.1f} s and ends after {last:.1f} s; copy it again if the rest is "
-                "needed."
-            )
+        if damaged or self.seconds > last + max(3 / self.rate, 0.1 * self.seconds):
+            ends = f"states {self.seconds:.1f} s and ends after {last:.1f} s"
+            self.notes.append(f"{self.path} {ends}; copy it again if the rest is needed.")
         if guessed:
             self.notes.append(
-                f"{self.path}: frames without a time stamp of their own are taken as {rate:g} a second; the motion is "
-                "too fast or too slow if that is wrong."
+                f"{self.path}: frames without a time stamp are taken as {self.rate:g} a second; the motion is too fast "
+                "or too slow if that is wrong."
             )
 
 

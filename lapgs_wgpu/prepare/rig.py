@@ -67,8 +67,8 @@ def place_still(films: Sequence[Film], images: Path, fps: float, work: Path) -> 
     names = [name for group in groups for name in group]
     source = Reconstruction(images, names, work, LENS, "SINGLE" if len(set(covering)) == 1 else "PER_FOLDER")
     pairs = [pair for names in times for pair in itertools.combinations(names, 2)]
-    matches = source.match(pairs)
-    joined = merged(source, matches, groups, work / "merged")
+    source.match(pairs)
+    joined = merged(source, groups, work / "merged")
     model = joined.solve()
     placed, least = 0 if model is None else model.num_reg_images(), max(2, len(groups) // 2)
     if placed < least:
