@@ -10,16 +10,16 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
 
 from lapgs_wgpu.data.images import ImageFile, Size, size_text
-from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, Fields, as_fields, matrix, read_json
+from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, Fields, as_fields, read_json
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.poses import OPENGL_TO_OPENCV, Array, check_rotation, opengl_pose, world_to_camera
 from lapgs_wgpu.data.readers.colmap_model import is_model, read_model
@@ -71,7 +71,11 @@ def read_calibration(path: Path) -> dict[str, Calibrated]:
     try:
         if path.suffix == ".json" and head:
             data = read_json(path)
-            cameras = _panoptic(data) if "cameras" in data else _nerfstudio(data)
+            if "cameras" in data:  # CMU Panoptic's
+                entries = {str(entry.required("name")): entry for entry in data.objects("cameras", "camera")}
+                cameras = _tabled(entries, "K", "distCoef", "R", "t", "resolution")
+            else:
+                cameras = _nerfstudio(data)
         elif head.startswith(b"<"):
             cameras = _qualisys(path)
         elif path.suffix == ".toml" and head:
@@ -98,27 +102,22 @@ def _nerfstudio(data: Fields) -> dict[str, Calibrated]:
     return cameras
 
 
-def _panoptic(data: Fields) -> dict[str, Calibrated]:
-    cameras = {}
-    for entry in data.objects("cameras", "camera"):
-        K, R, t, distortion = (np.array(entry.entries(name), np.float64) for name in ("K", "R", "t", "distCoef"))
-        name = str(entry.required("name"))
-        cameras[name] = _camera(K, distortion, R, t, entry.vector("resolution", 2), f"{entry.where} ({name})")
-    return cameras
-
-
 def _toml(path: Path) -> dict[str, Calibrated]:
-    cameras = {}
+    entries = {}
     for key, value in safe_json_toml.read_toml(path).items():
-        if not isinstance(value, dict) or "matrix" not in value:
-            continue  # metadata
-        entry = as_fields(value, f"{path}, {key}")
-        if entry.values.get("fisheye"):
-            raise InputError(f"{entry.where} has a fisheye lens, which is not read; undistort its film first.")
-        K = matrix(entry.required("matrix"), (3, 3), "matrix", entry.where)
-        rotation, translation = entry.vector("rotation", 3), entry.vector("translation", 3)
-        size, distortion = entry.vector("size", 2), entry.entries("distortions")
-        cameras[str(value.get("name", key))] = _camera(K, distortion, rotation, translation, size, entry.where)
+        if isinstance(value, dict) and "matrix" in value:  # others are metadata
+            entries[str(value.get("name", key))] = as_fields(value, f"{path}, {key}")
+            if value.get("fisheye"):
+                raise InputError(f"{path}, {key} has a fisheye lens, which is not read; undistort its film first.")
+    return _tabled(entries, "matrix", "distortions", "rotation", "translation", "size")
+
+
+def _tabled(entries: Mapping[str, Fields], *names: str) -> dict[str, Calibrated]:
+    """Of fields for K, distortion, rotation, translation and size."""
+    cameras = {}
+    for key, entry in entries.items():
+        K, distortion, rotation, translation, size = (np.array(entry.entries(name), np.float64) for name in names)
+        cameras[key] = _camera(K, distortion, rotation, translation, size, f"{entry.where} ({key})")
     return cameras
 
 
@@ -158,12 +157,7 @@ def _qualisys(path: Path) -> dict[str, Calibrated]:
 
 
 def _camera(
-    K: Array,
-    distortion: Iterable[Any],
-    rotation: Array,
-    translation: Array,
-    size: Iterable[float] | None,
-    where: str,
+    K: Array, distortion: Iterable[float], rotation: Array, translation: Array, size: Iterable[float] | None, where: str
 ) -> Calibrated:
     """Check the values of a camera of OpenCV. distortion: k1, k2, p1, p2, k3. rotation: (3, 3), or a Rodrigues vector.
     Raises InputError."""
@@ -171,6 +165,7 @@ def _camera(
 
     values = np.array([*distortion, *[0.0] * 5], np.float64)
     k1, k2, p1, p2, k3 = values[:5]
+    width, height = (max(1, round(float(side))) for side in (size if size is not None else 2 * K[:2, 2]))
     finite = all(np.isfinite(each).all() for each in (K, values, rotation, translation))
     if K.shape != (3, 3) or rotation.shape not in ((3,), (3, 3)) or translation.size != 3 or not finite:
         raise InputError(f"{where}: its matrices are not those of a camera (3x3, 3x3 or 3, 3 finite numbers).")
@@ -180,7 +175,6 @@ def _camera(
         raise InputError(f"{where}: focal lengths of {K[0, 0]:g} and {K[1, 1]:g} pixels are those of no camera.")
     R = Rotation.from_rotvec(rotation).as_matrix() if rotation.ndim == 1 else rotation
     check_rotation(R, f"{where}: its rotation")
-    width, height = (max(1, round(float(side))) for side in (size if size is not None else 2 * K[:2, 2]))
     cx, cy = K[0, 2] + 0.5, K[1, 2] + 0.5
     lens = Lens(width, height, K[0, 0], K[1, 1], cx, cy, K[0, 1], radial=(k1, k2, k3), tangential=(p1, p2))
     return Calibrated(lens, world_to_camera(R.T, -R.T @ translation.ravel()), where, size is not None)

@@ -7,7 +7,7 @@ import json
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -32,18 +32,9 @@ from lapgs_wgpu.progress import say
 LENS = "RADIAL"
 FEWEST, WHOLE = 0.3, 0.9  # of the images need a pose; of fewer than this only a part of the film fits
 LITTLE, MUCH = 0.002, 0.15  # share of the images: less motion needs no masks; more may have led the cameras astray
-FOLLOWED = 0.8  # least share of the image area in which the flow tells whether it moves; below it, a warning
 AGAIN = 0.98  # of the area that was explained before, at least, by cameras without what moves
 STANDING = 4e-3  # of the longer side: the image of a camera that stands still moves less over the film
-FEATURES, SHARED = 200, 60  # of an image; in common with the next one: fewer say why cameras are not found
-
-
-class Prepared(NamedTuple):
-    """A finished capture: the number of its images; of its cameras that have a pose; and of all its cameras."""
-
-    images: int
-    placed: int
-    cameras: int
+FEATURES, SHARED = 200, 60  # of an image; in common with the next one: wanted at least
 
 
 def prepare(
@@ -54,8 +45,8 @@ def prepare(
     masks: Path | None = None,
     poses: Path | None = None,
     calibration: Path | None = None,
-) -> Prepared:
-    """Make a capture of what one moving camera recorded, or several cameras that stand still.
+) -> None:
+    """Make a capture of what one moving camera recorded, or several cameras that stand still, and say how large it is.
 
     inputs: films, images, folders, patterns or zip files (`open_inputs`).
     out: a new or empty folder, or one whose capture was refused; it gets the capture when all of it is there.
@@ -87,7 +78,8 @@ def prepare(
                 model = _moving_camera(films[0], folder, pictures, masks, poses, work)
             placed = write_model(folder, model, pictures)
         shutil.rmtree(work, ignore_errors=True)
-    return Prepared(len(pictures), placed, len(films) if len(films) > 1 else len(pictures))
+    cameras = len(films) if len(films) > 1 else len(pictures)
+    say(f"{out}: {len(pictures)} images, {placed} of {cameras} cameras placed")
 
 
 def write_model(folder: Path, model: Any, pictures: Sequence[Picture]) -> int:
@@ -153,8 +145,7 @@ def _known(names: Sequence[str], poses: Path, size: Size) -> dict[str, tuple[Len
     if len(found) < 2:
         raise InputError(
             f"{poses} has {len(cameras)} cameras, such as {next(iter(cameras))[:80]}, and {len(found)} of {len(names)} "
-            f"images, such as {names[0]}, have one of their name; give the images for which it was made in place of "
-            "the film."
+            f"images, such as {names[0]}, have one of their name; give the images for which it was made."
         )
     return {name: (camera.lens_for(size), camera.T_cam_world) for name, camera in found.items()}
 
@@ -178,11 +169,6 @@ def _without_movers(source: Reconstruction, found: Found, motion: Motion) -> tup
             judged = judge(motion, other.model)
             if judged.explained(seen) > 1:
                 found, seen = other, judged
-    if seen.followed < FOLLOWED:
-        say(
-            f"what moves could not be looked for in {1 - seen.followed:.0%} of the image area, where nothing could be "
-            "followed from image to image: no mask covers that; film slower or with more light."
-        )
     if seen.moving > LITTLE:
         say(f"{seen.moving:.1%} of the image area moves: masked, and the cameras are placed again.")
         other = again(source, found, seen.rough())
@@ -201,18 +187,12 @@ def _without_movers(source: Reconstruction, found: Found, motion: Motion) -> tup
 
 def _refusal(source: Reconstruction, found: Found | None, folder: Path, pictures: Sequence[Picture]) -> RefusedError:
     """Why too few images have a camera; the cameras that were found are written."""
-    placed = 0
-    if found is not None:
-        placed = write_model(folder, found.model, pictures)
+    placed = 0 if found is None else write_model(folder, found.model, pictures)
     features = np.median([len(places) for places in source.places.values()])
     verified = source.verified()
     shared = np.median([len(verified.get(pair, ())) for pair in itertools.pairwise(source.names)])
-    advice = "film more of what stands still, or mask what moves (--masks)"
-    if features < FEATURES:
-        advice = "film something with more texture, in focus and with more light"
-    elif shared < SHARED:
-        advice = "film slower, so that an image shows most of what the one before it shows"
     return RefusedError(
         f"{placed} of {len(source.names)} images could be placed (at least {FEWEST:.0%} are needed): an image has "
-        f"{features:.0f} features, of which {shared:.0f} fit the next image (medians); {advice}."
+        f"{features:.0f} features (at least {FEATURES}), of which {shared:.0f} (at least {SHARED}) fit the next image; "
+        "film slower, in focus, with more light, texture and what stands still, or mask what moves (--masks)."
     )

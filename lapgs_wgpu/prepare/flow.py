@@ -27,7 +27,9 @@ MEET, MEET_SHARE = 1.5, 0.05  # pixels between a place and its way forth and bac
 
 class Motion:
     """The flow of a film. names: of its pictures. images: (h, w, 3) RGB, SIDE pixels at most, one of each picture.
-    flows: (h, w, 2) float16 pixels from each to the next one, and from the next one to each."""
+    flows: (h, w, 2) float16 pixels from each to the next one, and from the next one to each. grid: (rows, columns, 2)
+    the places of an image that are followed, pixels. tracks: of each image, where its grid is in the images around it,
+    by their offsets; NaN where it is lost."""
 
     def __init__(self, frames: Iterable[tuple[Pixels, bool]], names: Sequence[str]) -> None:
         """frames: small images of equal size in order, the first being a picture, and whether each is one."""
@@ -37,7 +39,6 @@ class Motion:
         self.names = names
         self.images: list[Pixels] = []
         self.flows: list[list[NDArray[np.float16]]] = []
-        self._tracks: dict[int, dict[int, Plane]] = {}
         before: Any = None
         flow: list[Plane] = []  # forth and back, from the last picture on
         with Progress(len(names), "images followed") as progress:
@@ -55,28 +56,23 @@ class Motion:
                     self.images.append(image)
                     flow = []
                     progress.at(len(self.images))
-
-    @property
-    def grid(self) -> Plane:
-        """(rows, columns, 2) the places of an image that are followed, pixels."""
         height, width = self.images[0].shape[:2]
-        columns, rows = np.arange(STEP // 2, width, STEP), np.arange(STEP // 2, height, STEP)
-        return np.stack(np.meshgrid(columns, rows), axis=-1).astype(np.float32)
+        places = np.meshgrid(np.arange(STEP // 2, width, STEP), np.arange(STEP // 2, height, STEP))
+        self.grid: Plane = np.stack(places, axis=-1).astype(np.float32)
+        self.tracks = [self._tracks(image) for image in range(len(self.images))]
 
-    def tracks(self, image: int) -> dict[int, Plane]:
-        """Where the grid of an image is in the images around it, by their offsets; NaN where it is lost."""
-        if image not in self._tracks:
-            found = self._tracks[image] = {}
-            before = [flow[::-1] for flow in self.flows[:image][::-1]]
-            for way, flows in ((1, self.flows[image:]), (-1, before)):
-                at = self.grid
-                for offset, (there, again) in enumerate(flows[:REACH], start=1):
-                    step = self._at(there.astype(np.float32), at)
-                    on = at + step
-                    apart = np.linalg.norm(step + self._at(again.astype(np.float32), on), axis=-1)
-                    on[~(apart < MEET + MEET_SHARE * np.linalg.norm(step, axis=-1))] = np.nan
-                    found[way * offset] = at = on
-        return self._tracks[image]
+    def _tracks(self, image: int) -> dict[int, Plane]:
+        found = {}
+        before = [flow[::-1] for flow in self.flows[:image][::-1]]
+        for way, flows in ((1, self.flows[image:]), (-1, before)):
+            at = self.grid
+            for offset, (there, again) in enumerate(flows[:REACH], start=1):
+                step = self._at(there.astype(np.float32), at)
+                on = at + step
+                apart = np.linalg.norm(step + self._at(again.astype(np.float32), on), axis=-1)
+                on[~(apart < MEET + MEET_SHARE * np.linalg.norm(step, axis=-1))] = np.nan
+                found[way * offset] = at = on
+        return found
 
     def on_grid(self, values: Plane, at: Plane) -> Plane:
         """Values (rows, columns) of a grid at places (rows, columns, 2) in pixels; NaN outside."""

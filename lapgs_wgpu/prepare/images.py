@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from lapgs_wgpu.data.evenly import evenly
-from lapgs_wgpu.data.images import Pixels, blurred, repeats, sharpness
+from lapgs_wgpu.data.images import Pixels, Size, blurred, repeats, sharpness, shrunk_size
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.film import Film, Frame
 from lapgs_wgpu.prepare.poses import import_cv2
@@ -30,24 +29,22 @@ JPEG_QUALITY = 95
 
 
 class Picture(NamedTuple):
-    """A written image. name: below the images' folder. seconds: since the first frame of its film. span: number of its
-    span of time, which is that of the other cameras' images of this time."""
+    """A written image. name: below the images' folder. seconds: since the first frame of its film."""
 
     name: str
     seconds: float
-    span: int = 0
 
 
 class Shape(NamedTuple):
-    """How the frames of a camera become images of one size. shrunk: longer side of the frames, pixels. cut: rows and
+    """How the frames of a camera become images of one size. shrunk: (width, height) of the frames before. cut: rows and
     columns of the shrunk frame. bent: (H, W, 2) places in the shrunk frame of the image's pixels, to undistort it."""
 
-    shrunk: int
+    shrunk: Size
     cut: tuple[slice, slice] = (slice(None), slice(None))
     bent: NDArray[np.float32] | None = None
 
     def apply(self, frame: Frame) -> Pixels:
-        image = frame.pixels(self.shrunk)
+        image = frame.pixels(max(self.shrunk))
         if self.bent is None:
             return image[self.cut]
         cv2 = import_cv2()
@@ -74,14 +71,14 @@ def extract(film: Film, images: Path, fps: float) -> list[Picture]:
     """
     pictures: list[Picture] = []
     sharp: list[float] = []
-    repeated, before = 0, None
-    for span, frames in _spans(film, fps):
+    repeated, before, shape = 0, None, Shape(shrunk_size(film.size, LONGER_SIDE))
+    for _, frames in _spans(film, fps):
         best = max(frames, key=lambda frame: sharpness(frame.gray))
         if before is not None and repeats(best.gray, before):
             repeated += 1
             continue
         before = best.gray
-        pictures.append(_write(span, best, images, "", Shape(LONGER_SIDE)))
+        pictures.append(_write(best, images, "", shape))
         sharp.append(sharpness(best.gray))
     soft = blurred(np.array(sharp))
     for picture in itertools.compress(pictures, soft):
@@ -95,8 +92,11 @@ def extract(film: Film, images: Path, fps: float) -> list[Picture]:
     return kept
 
 
-def extract_in_step(films: Sequence[Film], images: Path, fps: float, shapes: Sequence[Shape]) -> list[list[Picture]]:
-    """Write the images of cameras that stand still, below cam00, cam01, ...: as many of each, of the same times.
+def extract_in_step(
+    films: Sequence[Film], images: Path, fps: float, shapes: Sequence[Shape]
+) -> list[dict[int, Picture]]:
+    """Write the images of cameras that stand still, below cam00, cam01, ...: by the number of their span of time, which
+    is that of the other cameras' images of this time.
 
     None is left out, and all films end with the shortest.
     """
@@ -104,23 +104,16 @@ def extract_in_step(films: Sequence[Film], images: Path, fps: float, shapes: Seq
     cameras = []
     for number, (film, shape) in enumerate(zip(films, shapes, strict=True)):
         spans = _spans(film, fps)
-        pictures = [_write(span, next(frames), images, f"cam{number:02d}/", shape) for span, frames in spans]
+        pictures = {span: _write(next(frames), images, f"cam{number:02d}/", shape) for span, frames in spans}
         _tell(film, f"{film.path}: cam{number:02d}, {len(pictures)} images, one of each {1 / fps:.2g} s")
         cameras.append(pictures)
-    ends = [pictures[-1].seconds for pictures in cameras]
-    if max(ends) > min(ends) + 1 / fps:
-        say(f"the films are {min(ends):.2f} to {max(ends):.2f} s long; all are cut to {min(ends):.2f} s.")
-    for pictures in cameras:
-        while pictures[-1].seconds > min(ends) + 0.5 / fps:
-            (images / pictures.pop().name).unlink()
+    last = min(map(max, cameras))
+    longer = [(pictures, span) for pictures in cameras for span in pictures if span > last]
+    if longer:
+        say(f"the films are not equally long: all are cut to {last / fps:.2f} s.")
+    for pictures, span in longer:
+        (images / pictures.pop(span).name).unlink()
     return cameras
-
-
-def common_times(cameras: Sequence[Sequence[Picture]], most: int) -> list[tuple[Picture, ...]]:
-    """At most `most` times that all cameras filmed, in order: a picture of each camera."""
-    of_span = [{picture.span: picture for picture in pictures} for pictures in cameras]
-    shared = sorted(set.intersection(*map(set, of_span)))
-    return [tuple(own[span] for own in of_span) for span in evenly(shared, most)]
 
 
 def _spans(film: Film, fps: float) -> Iterator[tuple[int, Iterator[Frame]]]:
@@ -140,12 +133,12 @@ def _lit(film: Film) -> Iterator[Frame]:
         )
 
 
-def _write(span: int, frame: Frame, images: Path, prefix: str, shape: Shape) -> Picture:
+def _write(frame: Frame, images: Path, prefix: str, shape: Shape) -> Picture:
     """Write a JPEG image. prefix: of its name, such as "cam00/"."""
     name = f"{prefix}{frame.name or f'{round(1000 * frame.seconds):08d}'}.jpg"
     (images / name).parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(shape.apply(frame)).save(images / name, quality=JPEG_QUALITY, subsampling=0, exif=frame.exif)
-    return Picture(name, frame.seconds, span)
+    return Picture(name, frame.seconds)
 
 
 def _tell(film: Film, what: str) -> None:

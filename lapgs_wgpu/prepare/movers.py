@@ -119,7 +119,7 @@ def unexplained(motion: Motion, model: Any) -> tuple[Plane, float]:
 
     def errors(i: int, noise: NDArray[np.floating]) -> tuple[Floats, dict[int, Floats]]:
         """Of the grid (rows columns,), in times the noise; by offset, in pixels."""
-        tracks = {k: at for k, at in motion.tracks(i).items() if i + k in poses}
+        tracks = {k: at for k, at in motion.tracks[i].items() if i + k in poses}
         if i not in poses or len(tracks) < FEWEST:
             return np.full(motion.grid[..., 0].size, np.nan), {}
         relative = np.stack([poses[i + k] for k in tracks]) @ np.linalg.inv(poses[i])
@@ -170,7 +170,7 @@ def _votes(motion: Motion, errors: Plane) -> Plane:
     """The mean logarithm of the errors along each place's way, near images first."""
     logs, result = np.log(np.maximum(errors, 0.5)), []
     for i, own in enumerate(logs):
-        ways = {0: own} | {k: motion.on_grid(logs[i + k], at) for k, at in motion.tracks(i).items() if abs(k) <= VOTES}
+        ways = {0: own} | {k: motion.on_grid(logs[i + k], at) for k, at in motion.tracks[i].items() if abs(k) <= VOTES}
         votes = np.stack(list(ways.values()))
         weight = np.isfinite(votes) / (1.0 + np.abs(list(ways)))[:, None, None]
         with np.errstate(invalid="ignore"):  # NaN where no image tells

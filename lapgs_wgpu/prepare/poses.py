@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -41,7 +40,7 @@ class Reconstruction:
     def __init__(self, images: Path, names: Sequence[str], work: Path, model: str, lenses: str = "SINGLE") -> None:
         """Raises InputError where pycolmap is not installed."""
         self._colmap = colmap = import_pycolmap()
-        self.images, self.names, self.model, self.lenses = images, list(names), model, lenses
+        self.images, self.names = images, list(names)
         self.places: dict[str, Plane] = {}
         self.matches: dict[Pair, Ints] = {}
         self._database, self._models = work / "database.db", work / "models"
@@ -62,15 +61,26 @@ class Reconstruction:
         """The open pycolmap.Database, a context manager."""
         return self._colmap.Database.open(self._database)
 
-    def match(self, pairs: Sequence[Pair]) -> None:
-        """Find the features of all images, match those of pairs, keep places and matches, and verify these."""
-        descriptors = {}
+    def match(self, pairs: Sequence[Pair], shown: Mapping[str, Sequence[str]] | None = None) -> None:
+        """Find the features of all images, match those of pairs, keep places and matches, and verify these.
+
+        shown: names of further images, below the same folder, for cameras that stand still: an image has the features
+        of all of its own, as many for each and in the order of time, and those of one time are matched. So what moves
+        ties the cameras together, too, and the noise of several times is averaged.
+        """
+        descriptors: dict[str, list[Plane]] = {}
         with self.database() as database:
             for name in counted(self.names, len(self.names), "images searched for features"):
-                self.places[name], descriptors[name] = sift(self.images / name)
+                features = [sift(self.images / each) for each in (shown[name] if shown else [name])]
+                self.places[name] = np.concatenate([places for places, _ in features])
+                descriptors[name] = [looks for _, looks in features]
                 database.write_keypoints(self.ids[name], self.places[name])
-        for one, other in counted(pairs, len(pairs), "pairs of images matched"):
-            self.matches[one, other] = nearest(descriptors[one], descriptors[other])
+        for pair in counted(pairs, len(pairs), "pairs of images matched"):
+            found, before = [], np.zeros(2, np.int64)
+            for one, other in zip(*(descriptors[name] for name in pair), strict=True):
+                found.append(nearest(one, other) + before)
+                before += [len(one), len(other)]
+            self.matches[pair] = np.concatenate(found)
         self.use(self.matches)
 
     def hide(self, masks: Mapping[str, Mask]) -> None:
@@ -225,24 +235,3 @@ def import_cv2() -> Any:
     module = optional_module("cv2", "finding and following features needs OpenCV", "prepare")
     module.setRNGSeed(0)
     return module
-
-
-def merged(source: Reconstruction, groups: Sequence[Sequence[str]], work: Path) -> Reconstruction:
-    """One image for each group of images of a camera that stands still: it has the features of all of them.
-
-    Images of equal places in their groups were taken at the same time, and are matched. So what moves ties the cameras
-    together, too, and the noise of several times is averaged.
-    groups: names of images, as many for each camera. The first of each stands for the camera.
-    """
-    result = Reconstruction(source.images, [group[0] for group in groups], work, source.model, source.lenses)
-    first: dict[str, int] = {}  # of each image's features among those of its group
-    with result.database() as database:
-        for group in groups:
-            places = [source.places[name] for name in group]
-            first |= dict(zip(group, [0, *itertools.accumulate(len(each) for each in places)], strict=False))
-            database.write_keypoints(result.ids[group[0]], np.concatenate(places))
-    for one, other in itertools.combinations(groups, 2):
-        shared = [source.matches[pair] + [first[name] for name in pair] for pair in zip(one, other, strict=True)]
-        result.matches[one[0], other[0]] = np.concatenate(shared)
-    result.use(result.matches)
-    return result
