@@ -105,9 +105,7 @@ def _moving_camera(
     if moving is not None:
         source.hide(moving)
     found = described(source, source.given(known)) if known else search(source)
-    if found is None and known:
-        raise RefusedError(f"{poses}: what {len(known)} images show fits none of its cameras; give their own.")
-    if found is None or (not known and len(found.placed) < max(2, round(FEWEST * len(names)))):
+    if found is None or len(found.placed) < (1 if known else max(2, round(FEWEST * len(names)))):
         raise _refusal(source, found, folder, pictures)
     if known:
         say(f"{poses}: {len(found.placed)} of {len(names)} images have cameras, {found.error:.2f} pixels off (mean).")
@@ -127,8 +125,7 @@ def _moving_camera(
             "walk while you film if views from other places are wanted."
         )
     if found.held:
-        width = f"{found.focal / size[0]:.1f} of the width"
-        say(f"the film does not tell the focal length: {found.focal:.0f} pixels are taken, {width}.")
+        say(f"the film does not tell the focal length: {found.focal / size[0]:.1f} of the width are taken.")
     if len(found.placed) < WHOLE * len(names):
         part = longest_part(names, found.placed)
         say(
@@ -194,5 +191,6 @@ def _refusal(source: Reconstruction, found: Found | None, folder: Path, pictures
     return RefusedError(
         f"{placed} of {len(source.names)} images could be placed (at least {FEWEST:.0%} are needed): an image has "
         f"{features:.0f} features (at least {FEATURES}), of which {shared:.0f} (at least {SHARED}) fit the next image; "
-        "film slower, in focus, with more light, texture and what stands still, or mask what moves (--masks)."
+        "film slower, in focus, with more light, texture and what stands still, mask what moves (--masks), or give the "
+        "images' own cameras if you gave some (--poses)."
     )

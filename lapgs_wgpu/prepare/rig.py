@@ -14,6 +14,7 @@ import numpy as np
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.images import shrunk_size, size_text
 from lapgs_wgpu.data.readers.panoptic import FILES, IMAGES
+from lapgs_wgpu.data.stamps import natural_key
 from lapgs_wgpu.data.timestamps import CAMERAS
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.calibration import Calibrated, match_names, read_calibration
@@ -112,10 +113,12 @@ def common_times(cameras: Sequence[dict[int, Picture]]) -> list[int]:
 
 
 def _assigned(films: Sequence[Film], calibration: Path) -> list[Calibrated]:
-    """The camera of each film, by its name. Raises InputError."""
+    """The camera of each film, by its name, else by the order. Raises InputError."""
     cameras = read_calibration(calibration)
     names = [film.path.name for film in films]
     found = match_names(cameras, names)
+    if not found and len(cameras) == len(films):
+        found = dict(zip(sorted(names, key=natural_key), sorted(cameras, key=natural_key), strict=True))
     missing = [name for name in names if name not in found]
     if missing or len(set(found.values())) < len(films):
         raise InputError(
