@@ -110,13 +110,15 @@ def _looks(folder: Path, views: Sequence[View], cameras: Sequence[Camera] | None
     with ThreadPoolExecutor(4) as pool:
         loaded = pool.map(lambda view: view.load()[..., :3], itertools.chain(*chosen))
         images = iter(list(counted(loaded, sum(map(len, chosen)), "images looked at")))
-    looks = [[Look(view, next(images), _mask(folder, view)) for view in group] for group in chosen]
-    if cameras is not None:
-        for i, group in enumerate(looks):
-            levels = np.stack([_gray(look.image) for look in group])
+    looks: list[Look] = []
+    for group in chosen:
+        own = [Look(view, next(images), _mask(folder, view)) for view in group]
+        if cameras is not None:
+            levels = np.stack([_gray(look.image) for look in own])
             moves = np.abs(levels - np.median(levels, axis=0)) > LEVELS
-            looks[i] = [look._replace(mask=mask) for look, mask in zip(group, moves, strict=True)]
-    return list(itertools.chain(*looks))
+            own = [look._replace(mask=mask) for look, mask in zip(own, moves, strict=True)]
+        looks += own
+    return looks
 
 
 def _mask(folder: Path, view: View) -> Mask | None:

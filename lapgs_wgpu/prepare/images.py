@@ -88,7 +88,7 @@ def extract(film: Film, images: Path, fps: float) -> list[Picture]:
     told += f"repeated, {len(pictures) - len(kept)} blurred"
     if len(kept) < 2:
         raise InputError(f"{told}; give a longer recording, a part in which something moves, or a larger --fps.")
-    _tell(film, told)
+    say(told)
     return kept
 
 
@@ -105,7 +105,7 @@ def extract_in_step(
     for number, (film, shape) in enumerate(zip(films, shapes, strict=True)):
         spans = _spans(film, fps)
         pictures = {span: _write(next(frames), images, f"cam{number:02d}/", shape) for span, frames in spans}
-        _tell(film, f"{film.path}: cam{number:02d}, {len(pictures)} images, one of each {1 / fps:.2g} s")
+        say(f"{film.path}: cam{number:02d}, {len(pictures)} images, one of each {1 / fps:.2g} s")
         cameras.append(pictures)
     last = min(map(max, cameras))
     longer = [(pictures, span) for pictures in cameras for span in pictures if span > last]
@@ -139,8 +139,3 @@ def _write(frame: Frame, images: Path, prefix: str, shape: Shape) -> Picture:
     (images / name).parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(shape.apply(frame)).save(images / name, quality=JPEG_QUALITY, subsampling=0, exif=frame.exif)
     return Picture(name, frame.seconds)
-
-
-def _tell(film: Film, what: str) -> None:
-    for text in (what, *film.notes):
-        say(text)

@@ -19,6 +19,7 @@ from lapgs_wgpu.data.timestamps import TIMES, read_times
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.listing import is_desktop_file, listed
 from lapgs_wgpu.prepare.film import Film, Frame
+from lapgs_wgpu.progress import say
 
 HEIC_SUFFIXES = (".heic", ".heif", ".hif")
 IMAGE_SUFFIXES = (*SUFFIXES, *HEIC_SUFFIXES, ".avif", ".webp", ".tif", ".tiff", ".bmp")
@@ -36,7 +37,6 @@ class Stills(Film):
     def __init__(self, files: Sequence[Path]) -> None:
         """Read times and the first header. Raises InputError."""
         self.path = files[0].parent
-        self.notes = []
         if len(files) < 2:
             raise InputError(f"{files[0]} is one image; give all images of the camera, or the folder that holds them.")
         files = sorted(files, key=lambda file: natural_key(file.name))
@@ -45,7 +45,7 @@ class Stills(Film):
         unit = 1.0
         if source.startswith("the frame numbers"):
             unit = 1 / NUMBERED
-            self.notes.append(f"{self.path}: numbers in the names count images of {NUMBERED:g} a second.")
+            say(f"{self.path}: numbers in the names count images of {NUMBERED:g} a second.")
         order = np.argsort(times, kind="stable")
         self._files = [files[i] for i in order]
         self._times = unit * (np.array(times)[order] - min(times))

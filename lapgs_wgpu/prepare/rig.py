@@ -34,8 +34,6 @@ def shapes_of(films: Sequence[Film]) -> list[Shape]:
 
     Raises InputError for films of so different proportions that more than half of one would be cut off.
     """
-    for film in films:
-        next(film.frames(), None)  # which says how the film is turned
     sizes = [shrunk_size(film.size, LONGER_SIDE) for film in films]
     width, height = np.min(sizes, axis=0).tolist()
     shapes = []
