@@ -70,6 +70,7 @@ class Film:
             first = next(file.decode(stream), None)
         if first is None:
             raise InputError(f"{path} has no frame that can be decoded; give the recording itself.")
+        self._began = first.time or 0.0
         self.size: Size = display(first).size(_squared((first.width, first.height), self._aspect))
         if first.interlaced_frame:
             say(f"{path}: {INTERLACED}.")
@@ -78,21 +79,19 @@ class Film:
         """Decode the frames in the order of their times. Raises InputError; a film that is damaged after its first
         frames ends there, which is said."""
         av = import_av(self.path)
-        number, first, last, begin, damaged = 0, 0.0, -1.0, None, False
+        number, last, begin, damaged = 0, -1.0, None, False
         with opened_film(self.path) as (file, stream):
             try:
                 for frame in file.decode(stream):
                     shape = display(frame)
                     shown = _squared((frame.width, frame.height), self._aspect)
                     size = shape.size(shown)
-                    if number == 0:
-                        first = frame.time or 0.0
                     if size != self.size:
                         raise InputError(
                             f"{self.path}: frame {number} has {size_text(size)} pixels and the first has "
                             f"{size_text(self.size)}; cut the film where its size changes."
                         )
-                    seconds = -1.0 if frame.time is None else frame.time - first
+                    seconds = -1.0 if frame.time is None else frame.time - self._began
                     if number and seconds <= last:  # no time stamp, or one that was there before
                         seconds = last + 1 / self.rate
                     seconds = max(seconds, 0.0)
