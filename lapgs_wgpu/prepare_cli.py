@@ -42,20 +42,22 @@ def options() -> Parser:
     parser = Parser("lapgs-prepare", description=DESCRIPTION, formatter_class=HelpFormatter, allow_abbrev=False)
     # fmt: off
     add = parser.add_argument
-    add("films", nargs="*", metavar="FILM", help="films, one per camera; or images, folders, patterns, zip files")
-    add("--out", metavar="DIR", help="output folder for the capture; must be new or empty")
+    add("films", nargs="*", type=Path, metavar="FILM", help="films, one per camera; or images, folders, patterns, zip "
+        "files")
+    add("--out", type=Path, metavar="DIR", help="output folder for the capture; must be new or empty")
     add("--fps", type=float, help="maximum number of images per second of film [10 for a moving camera, 30 for "
         "static ones; less if a film would give more than 300 images]")
-    add("--masks", metavar="DIR", help="for one moving camera: folder of PNG masks, white where something moves, "
-        "with the file names of the images that an earlier run wrote; replaces the masks that are otherwise detected")
-    add("--poses", metavar="PATH", help="for one moving camera: the cameras of its images, by their names, from "
-        "COLMAP's layout (so VGGT's and MegaSaM's) or nerfstudio's; masks and diagnosis are made as usual")
-    add("--calibration", metavar="FILE", help="for static cameras: their lenses and places, from COLMAP, nerfstudio "
-        "(transforms.json), Qualisys (.qca.txt), Pose2Sim (.toml), OpenCV (.yml) or Panoptic (.json); each film is "
-        "named as its camera. Images are undistorted, and no training changes these cameras")
-    add("--check", metavar="DIR", help="instead of films: measure the existing capture in DIR, of any format that "
-        "lapgs-train reads, print parallax, path, motion, coverage and exposure, and write DIR/report.html. "
-        "Can be combined with --train and --minutes only")
+    add("--masks", type=Path, metavar="DIR", help="for one moving camera: folder of PNG masks, white where something "
+        "moves, with the file names of the images that an earlier run wrote; replaces the masks that are otherwise "
+        "detected")
+    add("--poses", type=Path, metavar="PATH", help="for one moving camera: the cameras of its images, by their names, "
+        "from COLMAP's layout (so VGGT's and MegaSaM's) or nerfstudio's; masks and diagnosis are made as usual")
+    add("--calibration", type=Path, metavar="FILE", help="for static cameras: their lenses and places, from COLMAP, "
+        "nerfstudio (transforms.json), Qualisys (.qca.txt), Pose2Sim (.toml), OpenCV (.yml) or Panoptic (.json); each "
+        "film is named as its camera. Images are undistorted, and no training changes these cameras")
+    add("--check", type=Path, metavar="DIR", help="instead of films: measure the existing capture in DIR, of any "
+        "format that lapgs-train reads, print parallax, path, motion, coverage and exposure, and write "
+        "DIR/report.html. Can be combined with --train and --minutes only")
     add("--train", action="store_true", help="then train. Preset, image size and number of steps are chosen from the "
         "graphics adapter, the capture and a short measurement; the run folder is runs/NAME, NAME that of the capture")
     add("--minutes", type=float, metavar="M", help="with --train: how long the training takes, about, evaluation "
@@ -68,55 +70,46 @@ def options() -> Parser:
 def _prepare(arguments: list[str]) -> None:
     given = options().parse_args(arguments)
     check_options(given)
-    capture = Path(given.check or given.out)
+    capture: Path = given.check or given.out
     run = Path("runs", capture.resolve().name)
     if given.train and run.exists() and (not run.is_dir() or listed(run)):  # now, not after minutes of work
-        from lapgs_wgpu.train.run_folder import has_state
-
-        goes_on = f"; {beside('lapgs-train')} --resume {quoted(run)} goes on with it" if has_state(run) else ""
         raise InputError(
-            f"{run} is there already, and the training would be written to it{goes_on}; move it, or work elsewhere."
+            f"{run} is there already, and the training would be written to it; move it, work elsewhere, or go on with "
+            f"it by {beside('lapgs-train')} --resume {quoted(run)}."
         )
-    if not given.check:
-        _convert(given, capture)
+    if given.out:
+        _convert(given)
         if given.train and sys.platform == "darwin":
             _train_anew(capture, given.minutes)
     diagnosis = _measure(capture)
     if given.train:
         _train(capture, run, given.minutes, diagnosis)
-    elif not given.check:
+    elif given.out:
         print(f"to train: {beside('lapgs-prepare')} --check {quoted(capture)} --train --minutes 20")
 
 
 def check_options(given: argparse.Namespace) -> None:
     """Raises InputError for options that do not go together."""
-    if given.check:
-        others = [name for name in ("out", "fps", "masks", "poses", "calibration") if getattr(given, name) is not None]
-        if given.films or others:
-            word = given.films[0] if given.films else f"--{others[0]}"
-            raise InputError(f"--check measures a capture that exists, so {word} cannot be given.")
-    elif not given.films:
-        raise InputError("name the films to convert, or a capture with --check; lapgs-prepare --help says more.")
-    elif given.out is None:
-        raise InputError("name the folder for the capture with --out.")
-    if given.minutes is not None and not given.train:
-        raise InputError("--minutes goes with --train.")
-    if given.minutes is not None and not 0 < given.minutes <= 1e5:
-        raise InputError(f"--minutes must be above 0 and at most 100000, got {given.minutes:g}.")
+    others = (given.out, given.fps, given.masks, given.poses, given.calibration)
+    if given.check and (given.films or any(other is not None for other in others)):
+        raise InputError("--check measures a capture that exists, and goes with --train and --minutes alone.")
+    if not given.check and not (given.films and given.out):
+        raise InputError("name films to convert and the capture's folder (--out), or a capture to measure (--check).")
+    if given.minutes is not None and not (given.train and 0 < given.minutes <= 1e5):
+        raise InputError(f"--minutes goes with --train, above 0 and at most 100000, got {given.minutes:g}.")
 
 
-def _convert(given: argparse.Namespace, out: Path) -> None:
+def _convert(given: argparse.Namespace) -> None:
     from lapgs_wgpu.prepare.capture import prepare  # after --help: numpy and Pillow take a while
     from lapgs_wgpu.prepare.capture_folder import RefusedError
     from lapgs_wgpu.prepare.report import write_refusal
 
-    paths = {name: Path(value) for name in ("masks", "poses", "calibration") if (value := getattr(given, name))}
+    chosen = {name: getattr(given, name) for name in ("fps", "masks", "poses", "calibration")}
     try:
-        done = prepare([Path(film) for film in given.films], out, fps=given.fps, **paths)
+        prepare(given.films, given.out, **chosen)
     except RefusedError as error:
-        write_refusal(out, str(error))
+        write_refusal(given.out, str(error))
         raise
-    print(f"{out}: {done.images} images, {done.placed} of {done.cameras} cameras placed", flush=True)
 
 
 def _measure(folder: Path) -> Diagnosis:
@@ -142,7 +135,7 @@ def _train(capture: Path, run: Path, minutes: float | None, diagnosis: Diagnosis
     from lapgs_wgpu.train.run_folder import result_text
 
     device = open_device()
-    exposure = (measure := diagnosis.measure("exposure")) is not None and measure.good is False
+    exposure = any(measure.name == "exposure" and measure.good is False for measure in diagnosis.measures)
     print("measuring some steps on this machine ...", file=sys.stderr, flush=True)
     plan = plan_training(capture, diagnosis.dataset, device, minutes=minutes, exposure=exposure)
     print(plan.text, flush=True)

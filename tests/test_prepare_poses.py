@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -81,9 +82,8 @@ def test_a_film_of_a_pan(tmp_path: Path, capfd: pytest.CaptureFixture) -> None:
         for x in np.linspace(-0.7, 0.7, 10)
     ]
     film = write_film(tmp_path / "pan.mp4", [drawn(camera, 0, Board())[0] for camera in cameras], rate=10)
-    done = prepare([film], tmp_path / "out")
-    assert done.placed == done.images == 10
-    assert "turns on the spot" in capfd.readouterr().out
+    prepare([film], tmp_path / "out")
+    assert re.search("(?s)turns on the spot.*10 images, 10 of 10 cameras placed", capfd.readouterr().out)
     data = load_dataset(tmp_path / "out")
     views = sorted((*data.train, *data.test), key=lambda view: view.time)
     found = np.stack([view.camera.T_cam_world[2, :3] for view in views])
@@ -119,8 +119,8 @@ def test_what_a_hand_does_not_do() -> None:
 def test_the_part_that_fits() -> None:
     names = [f"{i}" for i in range(20)]
     placed = [f"{i}" for i in (0, 1, 2, 8, 9, 11, 12, 14, 19)]
-    assert longest_part(names, placed, 2) == ("8", "9", "11", "12", "14")
-    assert longest_part(names, names, 0) == tuple(names)
+    assert longest_part(names, placed) == ["8", "9", "11", "12", "14"]
+    assert longest_part(names, names) == names
 
 
 def test_nearest_descriptors() -> None:

@@ -10,16 +10,16 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
 
 from lapgs_wgpu.data.images import ImageFile, Size, size_text
-from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, Fields, as_fields, matrix, read_json
+from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, Fields, as_fields, read_json
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.poses import OPENGL_TO_OPENCV, Array, check_rotation, opengl_pose, world_to_camera
 from lapgs_wgpu.data.readers.colmap_model import is_model, read_model
@@ -31,14 +31,8 @@ FORMATS = (
     "COLMAP's cameras and images, nerfstudio's transforms.json, .qca.txt of Qualisys, .toml of Pose2Sim, .yml of "
     "OpenCV, .json of Panoptic"
 )
-_MATRIX = re.compile(r"^(\w+):\s*!!opencv-matrix\s+rows:.*\s+cols:.*\s+dt:.*\s+data:\s*\[([^\]]*)\]", re.MULTILINE)
 SAME = 0.01  # by so much the proportions of images may differ from those that a file states
-_QUALISYS = [  # attributes, by their elements
-    *(f"transform.{n}" for n in ("x", "y", "z", *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)))),
-    *(f"intrinsic.{n}{axis}" for n in ("focalLength", "centerPoint") for axis in "UV"),
-    *(f"intrinsic.{n}Distortion{i}" for n in ("radial", "tangental") for i in (1, 2)),
-    *(f"fov_video.{side}" for side in ("left", "right", "top", "bottom")),
-]
+_MATRIX = re.compile(r"^(\w+):\s*!!opencv-matrix\s+rows:.*\s+cols:.*\s+dt:.*\s+data:\s*\[([^\]]*)\]", re.MULTILINE)
 _STEREO = {"M1": "K_1", "D1": "dist_1", "M2": "K_2", "D2": "dist_2", "R": "Rot_2", "T": "T_2"}
 
 
@@ -72,63 +66,67 @@ def read_calibration(path: Path) -> dict[str, Calibrated]:
         return {image.name: Calibrated(lenses[image.camera], image.T_cam_world, image.where) for image in images}
     inside = [path / "transforms.json", path / "intri.yml"]
     path = next((file for file in inside if file.is_file()), path)
-    if not path.is_file():
-        state = "holds no file of these" if path.exists() else "does not exist"
+    head = path.read_bytes()[:200].lstrip() if path.is_file() else b""
+    cameras: dict[str, Calibrated] = {}
+    try:
+        if path.suffix == ".json" and head:
+            data = read_json(path)
+            if "cameras" in data:  # CMU Panoptic's
+                entries = {str(entry.required("name")): entry for entry in data.objects("cameras", "camera")}
+                cameras = _tabled(entries, "K", "distCoef", "R", "t", "resolution")
+            else:
+                cameras = _nerfstudio(data)
+        elif head.startswith(b"<"):
+            cameras = _qualisys(path)
+        elif path.suffix == ".toml" and head:
+            cameras = _toml(path)
+        elif b"YAML" in head:
+            cameras = _opencv(path)
+    except InputError:
+        raise
+    except (SyntaxError, TypeError, ValueError) as error:  # of XML, numbers, arrays
+        raise InputError(f"{path} cannot be read ({str(error)[:80]}); export it again.") from None
+    if not cameras:
+        state = "holds no cameras in a known format" if path.exists() else "does not exist"
         raise InputError(f"{path} {state}: cameras are read from {FORMATS}.")
-    head = path.read_bytes()[:200].lstrip()
-    if path.suffix == ".json":
-        data = read_json(path)
-        return _panoptic(data) if "cameras" in data else _nerfstudio(data)
-    formats = (head.startswith(b"<"), _qualisys), (path.suffix == ".toml", _toml), (b"YAML" in head, _opencv)
-    for matches, read in formats:
-        if matches and (cameras := read(path)):
-            return cameras
-    raise InputError(f"{path} holds no cameras in a known format: they are read from {FORMATS}.")
+    return cameras
 
 
 def _nerfstudio(data: Fields) -> dict[str, Calibrated]:
     cameras = {}
     for entry in data.objects("frames", "frame"):
         name = str(entry.required("file_path"))
-        size = tuple((entry if side in entry else data).side(side) for side in ("w", "h"))
-        lens, _ = read_lens(entry, data, ImageFile(Path(name), (size[0], size[1])))
+        width, height = ((entry if side in entry else data).side(side) for side in "wh")
+        lens, _ = read_lens(entry, data, ImageFile(Path(name), (width, height)))
         cameras[name] = Calibrated(lens, opengl_pose(entry.required("transform_matrix"), entry.where), entry.where)
     return cameras
 
 
-def _panoptic(data: Fields) -> dict[str, Calibrated]:
-    cameras = {}
-    for entry in data.objects("cameras", "camera"):
-        K, R, t, distortion = (np.array(entry.entries(name), np.float64) for name in ("K", "R", "t", "distCoef"))
-        name = str(entry.required("name"))
-        cameras[name] = _camera(K, distortion, R, t, entry.vector("resolution", 2), f"{entry.where} ({name})")
-    return cameras
-
-
 def _toml(path: Path) -> dict[str, Calibrated]:
-    cameras = {}
+    entries = {}
     for key, value in safe_json_toml.read_toml(path).items():
-        if not isinstance(value, dict) or "matrix" not in value:
-            continue  # metadata
-        entry = as_fields(value, f"{path}, {key}")
-        if entry.values.get("fisheye"):
-            raise InputError(f"{entry.where} has a fisheye lens, which is not read; undistort its film first.")
-        K = matrix(entry.required("matrix"), (3, 3), "matrix", entry.where)
-        rotation, translation = entry.vector("rotation", 3), entry.vector("translation", 3)
-        size, distortion = entry.vector("size", 2), entry.entries("distortions")
-        cameras[str(value.get("name", key))] = _camera(K, distortion, rotation, translation, size, entry.where)
+        if isinstance(value, dict) and "matrix" in value:  # others are metadata
+            entries[str(value.get("name", key))] = as_fields(value, f"{path}, {key}")
+            if value.get("fisheye"):
+                raise InputError(f"{path}, {key} has a fisheye lens, which is not read; undistort its film first.")
+    return _tabled(entries, "matrix", "distortions", "rotation", "translation", "size")
+
+
+def _tabled(entries: Mapping[str, Fields], *names: str) -> dict[str, Calibrated]:
+    """Of fields for K, distortion, rotation, translation and size."""
+    cameras = {}
+    for key, entry in entries.items():
+        K, distortion, rotation, translation, size = (np.array(entry.entries(name), np.float64) for name in names)
+        cameras[key] = _camera(K, distortion, rotation, translation, size, f"{entry.where} ({key})")
     return cameras
 
 
 def _opencv(path: Path) -> dict[str, Calibrated]:
     """Of all matrices in the file, and in those that usually lie beside it."""
     beside = [path.with_name(name) for name in ("intri.yml", "extri.yml", "intrinsics.yml", "extrinsics.yml")]
-    files = [path, *(file for file in beside if file.is_file() and path in beside and file != path)]
-    found = {
-        _STEREO.get(name, name): np.array([float(number) for number in _numbers(text, file)])
-        for file in files
-        for name, text in _MATRIX.findall(file.read_text(encoding="utf-8", errors="replace"))
-    }
+    files = [path, *(file for file in beside if file.is_file() and path in beside)]
+    text = "\n".join(file.read_text(encoding="utf-8", errors="replace") for file in files)
+    found = {_STEREO.get(name, name): np.array(data.split(","), np.float64) for name, data in _MATRIX.findall(text)}
     if {"K_1", "Rot_2"} <= found.keys():  # the second camera's pose is that beside the first one
         found = {"Rot_1": np.eye(3).ravel(), "T_1": np.zeros(3)} | found
     cameras = {}
@@ -143,41 +141,23 @@ def _opencv(path: Path) -> dict[str, Calibrated]:
 
 
 def _qualisys(path: Path) -> dict[str, Calibrated]:
-    try:
-        root = ElementTree.parse(path).getroot()
-    except ElementTree.ParseError as error:
-        raise InputError(f"{path} is not readable XML ({error}); export it again.") from None
     cameras = {}
-    for number, camera in enumerate(root.iter("camera")):
-        where = f"{path}, camera {camera.get('serial', number)}"
-        parts = {tag: camera.find(tag) for tag in ("transform", "intrinsic", "fov_video")}
-        found = {f"{tag}.{k}": v for tag, part in parts.items() if part is not None for k, v in part.attrib.items()}
-        if missing := [name for name in _QUALISYS if name not in found]:
-            raise InputError(f"{where} has no {missing[0]}; export the calibration of video cameras.")
-        x, y, z, *R, fx, fy, cx, cy, k1, k2, p1, p2, left, right, top, bottom = _numbers(
-            ",".join(found[name] for name in _QUALISYS), where
-        )
-        rotation = OPENGL_TO_OPENCV @ np.array(R).reshape(3, 3)
+    for i, camera in enumerate(ElementTree.parse(path).iter("camera")):
+        name = camera.get("serial", str(i))
+        parts = [part for tag in ("transform", "intrinsic", "fov_video") for part in camera.findall(tag)]
+        values = Fields({key: value for part in parts for key, value in part.attrib.items()}, f"{path}, camera {name}")
+        fx, fy, cx, cy = (values.number(f"{key}{axis}") for key in ("focalLength", "centerPoint") for axis in "UV")
+        left, right, top, bottom = (values.number(side) for side in ("left", "right", "top", "bottom"))
+        distortion = [values.number(f"{key}Distortion{n}") for key in ("radial", "tangental") for n in (1, 2)]
+        R = OPENGL_TO_OPENCV @ [[values.number(f"r{n}{m}") for m in (1, 2, 3)] for n in (1, 2, 3)]
+        t = -R @ [values.number(axis) for axis in "xyz"] / 1000
         K = np.array([[fx / 64, 0, cx / 64 - left], [0, fy / 64, cy / 64 - top], [0, 0, 1]])
-        size, t = (right - left + 1, bottom - top + 1), -rotation @ np.array([x, y, z]) / 1000
-        cameras[camera.get("serial", str(number))] = _camera(K, [k1, k2, p1, p2], rotation, t, size, where)
+        cameras[name] = _camera(K, distortion, R, t, (right - left + 1, bottom - top + 1), values.where)
     return cameras
 
 
-def _numbers(text: str, where: object) -> list[float]:
-    try:
-        return [float(word) for word in text.split(",")]
-    except ValueError as error:
-        raise InputError(f"{where}: {str(error)[:80]}; export it again.") from None
-
-
 def _camera(
-    K: Array,
-    distortion: Iterable[Any],
-    rotation: Array,
-    translation: Array,
-    size: Iterable[float] | None,
-    where: str,
+    K: Array, distortion: Iterable[float], rotation: Array, translation: Array, size: Iterable[float] | None, where: str
 ) -> Calibrated:
     """Check the values of a camera of OpenCV. distortion: k1, k2, p1, p2, k3. rotation: (3, 3), or a Rodrigues vector.
     Raises InputError."""
@@ -185,6 +165,7 @@ def _camera(
 
     values = np.array([*distortion, *[0.0] * 5], np.float64)
     k1, k2, p1, p2, k3 = values[:5]
+    width, height = (max(1, round(float(side))) for side in (size if size is not None else 2 * K[:2, 2]))
     finite = all(np.isfinite(each).all() for each in (K, values, rotation, translation))
     if K.shape != (3, 3) or rotation.shape not in ((3,), (3, 3)) or translation.size != 3 or not finite:
         raise InputError(f"{where}: its matrices are not those of a camera (3x3, 3x3 or 3, 3 finite numbers).")
@@ -194,7 +175,6 @@ def _camera(
         raise InputError(f"{where}: focal lengths of {K[0, 0]:g} and {K[1, 1]:g} pixels are those of no camera.")
     R = Rotation.from_rotvec(rotation).as_matrix() if rotation.ndim == 1 else rotation
     check_rotation(R, f"{where}: its rotation")
-    width, height = (max(1, round(float(side))) for side in (size if size is not None else 2 * K[:2, 2]))
     cx, cy = K[0, 2] + 0.5, K[1, 2] + 0.5
     lens = Lens(width, height, K[0, 0], K[1, 1], cx, cy, K[0, 1], radial=(k1, k2, k3), tangential=(p1, p2))
     return Calibrated(lens, world_to_camera(R.T, -R.T @ translation.ravel()), where, size is not None)

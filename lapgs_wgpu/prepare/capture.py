@@ -7,13 +7,12 @@ import json
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from lapgs_wgpu.data.images import Size, check_image
 from lapgs_wgpu.data.lens import Lens
-from lapgs_wgpu.data.masks import Mask, check_mask_folder
 from lapgs_wgpu.data.readers.colmap import IMAGES, SPARSE
 from lapgs_wgpu.data.timestamps import TIMES
 from lapgs_wgpu.errors import InputError
@@ -23,8 +22,8 @@ from lapgs_wgpu.prepare.film import Film
 from lapgs_wgpu.prepare.flow import Motion, film_frames
 from lapgs_wgpu.prepare.images import Picture, extract, images_per_second
 from lapgs_wgpu.prepare.inputs import open_inputs
-from lapgs_wgpu.prepare.movers import RIM, cut_out, judge, read_masks, without, write_masks
-from lapgs_wgpu.prepare.poses import Floats, Match, Reconstruction, import_cv2, import_pycolmap, neighbouring_pairs
+from lapgs_wgpu.prepare.movers import RIM, Judged, cut_out, judge, read_masks, write_masks
+from lapgs_wgpu.prepare.poses import Floats, Reconstruction, import_cv2, import_pycolmap, neighbouring_pairs
 from lapgs_wgpu.prepare.rig import place_calibrated, place_still
 from lapgs_wgpu.prepare.search import Found, again, described, longest_part, search
 from lapgs_wgpu.progress import say
@@ -33,18 +32,9 @@ from lapgs_wgpu.progress import say
 LENS = "RADIAL"
 FEWEST, WHOLE = 0.3, 0.9  # of the images need a pose; of fewer than this only a part of the film fits
 LITTLE, MUCH = 0.002, 0.15  # share of the images: less motion needs no masks; more may have led the cameras astray
-FOLLOWED = 0.8  # least share of the image area in which the flow tells whether it moves; below it, a warning
 AGAIN = 0.98  # of the area that was explained before, at least, by cameras without what moves
 STANDING = 4e-3  # of the longer side: the image of a camera that stands still moves less over the film
-FEATURES, SHARED = 200, 60  # of an image; in common with the next one: fewer say why cameras are not found
-
-
-class Prepared(NamedTuple):
-    """A finished capture: the number of its images; of its cameras that have a pose; and of all its cameras."""
-
-    images: int
-    placed: int
-    cameras: int
+FEATURES, SHARED = 200, 60  # of an image; in common with the next one: wanted at least
 
 
 def prepare(
@@ -55,8 +45,8 @@ def prepare(
     masks: Path | None = None,
     poses: Path | None = None,
     calibration: Path | None = None,
-) -> Prepared:
-    """Make a capture of what one moving camera recorded, or several cameras that stand still.
+) -> None:
+    """Make a capture of what one moving camera recorded, or several cameras that stand still, and say how large it is.
 
     inputs: films, images, folders, patterns or zip files (`open_inputs`).
     out: a new or empty folder, or one whose capture was refused; it gets the capture when all of it is there.
@@ -68,30 +58,28 @@ def prepare(
     """
     if fps is not None and not 0 < fps <= 1000:
         raise InputError(f"--fps must be above 0 and at most 1000, got {fps:g}.")
-    if masks is not None:
-        check_mask_folder(masks, "each image")
     import_pycolmap()
     import_cv2()
     with appearing(out) as folder:
         work = folder / WORK
         films = open_inputs(inputs, work)
-        of_one = [option for option, given in (("--masks", masks), ("--poses", poses)) if given is not None]
-        if of_one and len(films) > 1:
-            raise InputError(f"{of_one[0]} goes with one moving camera, and there are {len(films)} films.")
-        if calibration is not None and len(films) == 1:
+        if len(films) > 1 and (masks or poses):
+            raise InputError(f"--masks and --poses go with one moving camera, and there are {len(films)} films.")
+        if len(films) == 1 and calibration:
             raise InputError("--calibration goes with several cameras; --poses gives those of one that moves.")
         rate = images_per_second(films, fps)
         if calibration is not None:
             pictures, placed = place_calibrated(films, folder, rate, calibration), len(films)
-        elif len(films) > 1:
-            pictures, model = place_still(films, folder / IMAGES, rate, work)
-            placed = write_model(folder, model, pictures)
         else:
-            pictures = extract(films[0], folder / IMAGES, rate)
-            model = _moving_camera(films[0], folder, pictures, masks, poses, work)
+            if len(films) > 1:
+                pictures, model = place_still(films, folder / IMAGES, rate, work)
+            else:
+                pictures = extract(films[0], folder / IMAGES, rate)
+                model = _moving_camera(films[0], folder, pictures, masks, poses, work)
             placed = write_model(folder, model, pictures)
         shutil.rmtree(work, ignore_errors=True)
-    return Prepared(len(pictures), placed, len(films) if len(films) > 1 else len(pictures))
+    cameras = len(films) if len(films) > 1 else len(pictures)
+    say(f"{out}: {len(pictures)} images, {placed} of {cameras} cameras placed")
 
 
 def write_model(folder: Path, model: Any, pictures: Sequence[Picture]) -> int:
@@ -109,42 +97,37 @@ def _moving_camera(
     """The pycolmap.Reconstruction; writes masks of what moves. masks, poses: the user's; None to find them."""
     names = [picture.name for picture in pictures]
     size = check_image(folder / IMAGES / names[0], whole=False).size
-    given = None if masks is None else read_masks(masks, names, size)
-    known = None if poses is None else _known(names, poses, size)
-    lenses = "SINGLE" if known is None or len(set(known[0].values())) == 1 else "PER_IMAGE"
-    source = Reconstruction(folder / IMAGES, names, work, LENS if known is None else "OPENCV", lenses)
-    matches = source.match(neighbouring_pairs(names))
-    if given is not None:
-        rest = without(matches, source.places, given, size)
-        before, after = (sum(map(len, each.values())) for each in (matches, rest))
-        say(f"{masks}: {1 - after / max(before, 1):.0%} of the matches are masked.")
-        source.use(rest)
-    if known is not None:
-        found = described(source, source.given(*known))
-        if found is None:
-            raise RefusedError(f"{poses}: what {len(known[0])} images show fits none of its cameras; give their own.")
+    moving = None if masks is None else read_masks(masks, names, size)
+    known = {} if poses is None else _known(names, poses, size)
+    lenses = "SINGLE" if len({lens for lens, _ in known.values()}) < 2 else "PER_IMAGE"
+    source = Reconstruction(folder / IMAGES, names, work, "OPENCV" if known else LENS, lenses)
+    source.match(neighbouring_pairs(names))
+    if moving is not None:
+        source.hide(moving)
+    found = described(source, source.given(known)) if known else search(source)
+    if found is None or len(found.placed) < (1 if known else max(2, round(FEWEST * len(names)))):
+        raise _refusal(source, found, folder, pictures)
+    if known:
         say(f"{poses}: {len(found.placed)} of {len(names)} images have cameras, {found.error:.2f} pixels off (mean).")
-    else:
-        found = _checked(source, search(source, size), size, folder, pictures)
-    if given is None:
+    if moving is None:
         motion = Motion(film_frames(film, pictures), names)
-        if known is not None:
-            given = cut_out(motion, judge(motion, found.model))
+        if known:
+            seen = judge(motion, found.model)
         else:
-            found, given = _without_movers(source, found, motion, matches, size)
-    write_masks(folder / MASKS, given)
+            found, seen = _without_movers(source, found, motion)
+        moving = cut_out(motion, seen)
+    write_masks(folder / MASKS, moving)
     if found.pan is not None:
         turns = "stands still" if found.pan.travel < STANDING * max(size) else "turns on the spot"
         say(
             f"the camera {turns}: turning alone explains {found.pan.explained:.0%} of what several images show, over "
-            f"{found.pan.travel:.0f} pixels. It is placed as a pan: a panorama at one depth, what moves in front of "
-            "it. Walk while you film if views from other places are wanted."
+            f"{found.pan.travel:.0f} pixels. It is placed as a pan, a panorama at one depth with what moves in front; "
+            "walk while you film if views from other places are wanted."
         )
     if found.held:
-        width = f"{found.focal / size[0]:.1f} of the width"
-        say(f"the film does not tell the focal length: {found.focal:.0f} pixels are taken, {width}.")
-    if found.pan is None and len(found.placed) < WHOLE * len(names):
-        part = longest_part(names, found.placed, 2)
+        say(f"the film does not tell the focal length: {found.focal / size[0]:.1f} of the width are taken.")
+    if len(found.placed) < WHOLE * len(names):
+        part = longest_part(names, found.placed)
         say(
             f"only a part of the film fits together: {len(found.placed)} of {len(names)} images, {len(part)} of them "
             f"in a row from {part[0]} to {part[-1]}; the training leaves out the others."
@@ -152,23 +135,19 @@ def _moving_camera(
     return found.model
 
 
-def _known(names: Sequence[str], poses: Path, size: Size) -> tuple[dict[str, Lens], dict[str, Floats]]:
+def _known(names: Sequence[str], poses: Path, size: Size) -> dict[str, tuple[Lens, Floats]]:
     """Lens and pose of the images that have a camera of their name. Raises InputError."""
     cameras = read_calibration(poses)
-    found = match_names(cameras, names)
+    found = {name: cameras[camera] for name, camera in match_names(cameras, names).items()}
     if len(found) < 2:
         raise InputError(
             f"{poses} has {len(cameras)} cameras, such as {next(iter(cameras))[:80]}, and {len(found)} of {len(names)} "
-            f"images, such as {names[0]}, have one of their name; give the images for which it was made in place of "
-            "the film."
+            f"images, such as {names[0]}, have one of their name; give the images for which it was made."
         )
-    lenses = {name: cameras[camera].lens_for(size) for name, camera in found.items()}
-    return lenses, {name: cameras[camera].T_cam_world for name, camera in found.items()}
+    return {name: (camera.lens_for(size), camera.T_cam_world) for name, camera in found.items()}
 
 
-def _without_movers(
-    source: Reconstruction, found: Found, motion: Motion, matches: Match, size: Size
-) -> tuple[Found, dict[str, Mask]]:
+def _without_movers(source: Reconstruction, found: Found, motion: Motion) -> tuple[Found, Judged]:
     """Find what moves, and place the cameras again without it.
 
     A reconstruction follows whatever its features agree on most, which may be what moves, in all images or in some.
@@ -181,21 +160,15 @@ def _without_movers(
             break
         of = "the images' rims" if rims else "what disagrees"
         say(f"{seen.moving:.0%} of the image area disagrees with these cameras: trying {of} alone.")
-        hidden = dict.fromkeys(source.names, RIM) if rims else seen.rough(turned_over=True)
-        source.use(without(matches, source.places, hidden, size))
-        other = search(source, size, rival=True)
+        source.hide(dict.fromkeys(source.names, RIM) if rims else seen.rough(turned_over=True))
+        other = search(source, rival=True)
         if other is not None and len(other.placed) >= FEWEST * len(source.names):
             judged = judge(motion, other.model)
             if judged.explained(seen) > 1:
                 found, seen = other, judged
-    if seen.followed < FOLLOWED:
-        say(
-            f"what moves could not be looked for in {1 - seen.followed:.0%} of the image area, where nothing could be "
-            "followed from image to image: no mask covers that; film slower or with more light."
-        )
     if seen.moving > LITTLE:
         say(f"{seen.moving:.1%} of the image area moves: masked, and the cameras are placed again.")
-        other = again(source, found, matches, seen.rough(), size)
+        other = again(source, found, seen.rough())
         if other is not None and len(other.placed) >= len(found.placed) and len(other.faults) <= len(found.faults):
             judged = judge(motion, other.model)
             if judged.explained(seen) > AGAIN:  # else the masks took too much
@@ -206,32 +179,18 @@ def _without_movers(
             "does not fit their cameras, which may follow what moves: leave out that part of the film, or mask what "
             "moves (--masks)."
         )
-    return found, cut_out(motion, seen)
+    return found, seen
 
 
-def _checked(
-    source: Reconstruction, found: Found | None, size: Size, folder: Path, pictures: Sequence[Picture]
-) -> Found:
-    """Raises RefusedError where too few images have a pose, whose cameras are written."""
-    placed, least = len(found.placed) if found else 0, max(2, round(FEWEST * len(source.names)))
-    if found is None or placed < least:
-        features = int(np.median([len(places) for places in source.places.values()]))
-        verified = source.verified()
-        shared = [len(verified.get(pair, ())) for pair in itertools.pairwise(source.names)]
-        advice = "film more of what stands still, or mask what moves (--masks)"
-        if features < FEATURES:
-            advice = "film something with more texture, in focus and with more light"
-        elif np.median(shared) < SHARED:
-            advice = "film slower, so that an image shows most of what the one before it shows"
-        part = ""
-        if found is not None:
-            write_model(folder, found.model, pictures)
-            whole = longest_part(source.names, found.placed, 2)
-            part = f"; what fits together are {len(whole)} images from {whole[0]} to {whole[-1]}"
-        worst = int(np.argmin(shared))
-        raise RefusedError(
-            f"{placed} of {len(source.names)} images could be placed (at least {least} are needed): an image has "
-            f"{features} features, of which {np.median(shared):.0f} fit the next image (medians), fewest, "
-            f"{shared[worst]}, from {source.names[worst]} to {source.names[worst + 1]}{part}; {advice}."
-        )
-    return found
+def _refusal(source: Reconstruction, found: Found | None, folder: Path, pictures: Sequence[Picture]) -> RefusedError:
+    """Why too few images have a camera; the cameras that were found are written."""
+    placed = 0 if found is None else write_model(folder, found.model, pictures)
+    features = np.median([len(places) for places in source.places.values()])
+    verified = source.verified()
+    shared = np.median([len(verified.get(pair, ())) for pair in itertools.pairwise(source.names)])
+    return RefusedError(
+        f"{placed} of {len(source.names)} images could be placed (at least {FEWEST:.0%} are needed): an image has "
+        f"{features:.0f} features (at least {FEATURES}), of which {shared:.0f} (at least {SHARED}) fit the next image; "
+        "film slower, in focus, with more light, texture and what stands still, mask what moves (--masks), or give the "
+        "images' own cameras if you gave some (--poses)."
+    )

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from lapgs_wgpu.data.load import READERS
 from lapgs_wgpu.data.readers.colmap import IMAGES, SPARSE
 from lapgs_wgpu.data.timestamps import TIMES
 from lapgs_wgpu.errors import InputError, quoted
@@ -32,13 +31,15 @@ def appearing(out: Path) -> Iterator[Path]:
     the contents cannot be moved: then they stay, and the error says where. What a refused capture left in `out` is
     replaced, and stays until then.
     """
-    _check_empty(out)
-    partial = out / UNFINISHED
+    partial, refused = out / UNFINISHED, ""
     with locked_folder(out, "lapgs-prepare"):
-        _check_empty(out)
+        if not (out / REFUSED).is_file() and {entry.name for entry in listed(out)} - {UNFINISHED, LOCK}:
+            raise InputError(
+                f"{out} is not empty; name a new folder with --out, or, if it is a capture, measure it by "
+                f"lapgs-prepare --check {quoted(out)}, with --train to train on it."
+            )
         shutil.rmtree(partial, ignore_errors=True)  # of a process that was killed
         partial.mkdir()
-        refused = None
         try:
             yield partial
         except RefusedError as error:
@@ -60,22 +61,8 @@ def appearing(out: Path) -> Iterator[Path]:
                 f"{partial} holds the finished capture, which could not be moved to {out} ({error.strerror or error}); "
                 "move what is in it to a folder of your choice."
             ) from None
-        if refused is not None:
+        if refused:
             raise RefusedError(
                 f"{refused} Images and what was found stay in {out}: the same command goes on there, with --masks or "
                 "--poses for these images if you have any."
             )
-
-
-def _check_empty(out: Path) -> None:
-    if (out / REFUSED).is_file():
-        return
-    if out.is_dir() and not {entry.name for entry in listed(out)} - {UNFINISHED, LOCK}:
-        return
-    if out.is_dir() and any(reader.matches(out) for reader in READERS):
-        raise InputError(
-            f"{out} is a capture already; lapgs-prepare --check {quoted(out)} --train measures it and trains on it; or "
-            "name a new folder with --out."
-        )
-    if out.exists():
-        raise InputError(f"{out} is not an empty folder; name a new one with --out.")

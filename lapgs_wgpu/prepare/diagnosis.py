@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-import warnings
+from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -34,20 +34,19 @@ LITTLE = 0.01  # share of the images that moves, at least
 SEEN = 0.002  # share of an image that moves, from which on it shows something that does
 POINTS_SEEN = 30  # in an image whose exposure is measured
 NAMED = 3  # faults of a path
-UNKNOWN = float("nan"), "not measured"
 
 
 class Measure(NamedTuple):
-    """One property. number: NaN where it cannot be measured. value: the same as a text with units. least, most: of a
-    good one. wanted: these as a text. advice: what to film differently, or why there is no number."""
+    """One property. least, most: of a good one. wanted: these as a text. advice: what to film differently, or why there
+    is no number. number: NaN where it cannot be measured. value: the same as a text with units."""
 
     name: str
-    number: float
-    value: str
     least: float
     most: float
     wanted: str
     advice: str
+    number: float = math.nan
+    value: str = "not measured"
 
     @property
     def good(self) -> bool | None:
@@ -99,8 +98,8 @@ def diagnose(folder: Path) -> Diagnosis:
     if still:
         measures += [coverage(looks), spacing(cameras, dataset.focus)]
     else:
-        measures.append(path(views, points))
-        measures.append(exposure(looks, points if dataset.cloud is not None else None))
+        cloud = points if dataset.cloud is not None else np.zeros((0, 3))
+        measures += [path(views, points), exposure(looks, cloud)]
     return Diagnosis(dataset, still, measures, looks)
 
 
@@ -108,17 +107,17 @@ def _looks(folder: Path, views: Sequence[View], cameras: Sequence[Camera] | None
     """The images of some views by time, with masks. cameras: those that stand still; then all show the same times."""
     groups = [views] if cameras is None else [[view for view in views if view.camera is camera] for camera in cameras]
     chosen = [evenly(group, max(3, MOST_VIEWS // len(groups))) for group in groups]
-    looks: list[Look] = []
     with ThreadPoolExecutor(4) as pool:
         loaded = pool.map(lambda view: view.load()[..., :3], itertools.chain(*chosen))
-        rest = list(counted(loaded, sum(map(len, chosen)), "images looked at"))
+        images = iter(list(counted(loaded, sum(map(len, chosen)), "images looked at")))
+    looks: list[Look] = []
     for group in chosen:
-        images, rest = rest[: len(group)], rest[len(group) :]
-        masks: list[Mask | None] = [_mask(folder, view) for view in group]
+        own = [Look(view, next(images), _mask(folder, view)) for view in group]
         if cameras is not None:
-            levels = np.stack([_gray(image) for image in images])
-            masks = list(np.abs(levels - np.median(levels, axis=0)) > LEVELS)
-        looks += map(Look, group, images, masks)
+            levels = np.stack([_gray(look.image) for look in own])
+            moves = np.abs(levels - np.median(levels, axis=0)) > LEVELS
+            own = [look._replace(mask=mask) for look, mask in zip(own, moves, strict=True)]
+        looks += own
     return looks
 
 
@@ -146,16 +145,13 @@ def parallax(cameras: Sequence[Camera], points: Floats) -> Measure:
     seen = np.stack([in_view(points, camera)[1] for camera in chosen])
     away = points - np.stack([camera.position for camera in chosen])[:, None]
     rays = np.where(seen[..., None], away / np.maximum(np.linalg.norm(away, axis=2, keepdims=True), 1e-12), np.nan)
-    least = np.ones(len(points))
-    for ray in rays:
-        least = np.fmin(least, np.fmin.reduce(np.einsum("cni,ni->cn", rays, ray), axis=0))
-    several = seen.sum(axis=0) > 1
-    degrees = float(np.median(np.degrees(np.arccos(np.clip(least[several], -1, 1))))) if several.any() else 0.0
+    least = np.fmin.reduce(np.einsum("cni,dni->cdn", rays, rays), axis=(0, 1))[seen.sum(axis=0) > 1]
+    degrees = float(np.median(np.degrees(np.arccos(np.clip(least, -1, 1))))) if len(least) else 0.0
     value = f"{degrees:.1f} degrees between the two cameras furthest apart that see a point"
     advice = "walk (further) around what moves instead of turning on the spot, or put the cameras further apart: depth "
     advice += "is a guess, and the other sides stay empty"
     # Half a pixel of a phone's image is 1 % of the depth at 5 degrees.
-    return Measure("parallax", degrees, value, 5, math.inf, "5 or more", advice)
+    return Measure("parallax", 5, math.inf, "5 or more", advice, degrees, value)
 
 
 def path(views: Sequence[View], points: Floats) -> Measure:
@@ -163,36 +159,34 @@ def path(views: Sequence[View], points: Floats) -> Measure:
     places = np.stack([view.camera.position for view in views])
     axes = np.stack([view.camera.T_cam_world[2, :3] for view in views])
     faults = path_faults(places, axes, points, [view.source for view in views])
-    named = ", ".join(f"{what} at {Path(views[i].source).name}" for what, i in faults[:NAMED])
-    more = f" and {len(faults) - NAMED} more" if len(faults) > NAMED else ""
+    value = ", ".join(f"{what} at {Path(views[i].source).name}" for what, i in faults[:NAMED])
+    value += f" and {len(faults) - NAMED} more" if len(faults) > NAMED else ""
     wanted = f"no step above {STEP:g} and no turn above {TURN:g} times the usual one, no doubling back or stall, at "
     wanted += f"most {AROUND:g} degrees a second around the scene"
     advice = "the cameras are likely wrong there: cut the film at these images, or film that part more slowly"
-    return Measure("path", len(faults), f"{named}{more}" or "smooth", 0, 0, wanted, advice)
+    return Measure("path", 0, 0, wanted, advice, len(faults), value or "smooth")
 
 
 def moving_share(looks: Sequence[Look]) -> Measure:
     """Share of the images that moves."""
+    measure = Measure("moving share", LITTLE, 0.5, "1% to 50%", "no masks of what moves, which lapgs-prepare makes")
     shares = [look.mask.mean() for look in looks if look.mask is not None]
-    share, value = (float(np.mean(shares)), f"{np.mean(shares):.1%} of the image area moves") if shares else UNKNOWN
+    if not shares:
+        return measure
+    share = float(np.mean(shares))
     advice = "leave more of what stands still in the picture, since the cameras are placed by that"
     if share < LITTLE:
         advice = "film longer, or closer, or train with --field static: hardly anything moves"
-    if not shares:
-        advice = "no masks of what moves, which lapgs-prepare makes of films"
-    return Measure("moving share", share, value, LITTLE, 0.5, "1% to 50%", advice)
+    return measure._replace(number=share, value=f"{share:.1%} of the image area moves", advice=advice)
 
 
 def coverage(looks: Sequence[Look]) -> Measure:
     """Of cameras that stand still: how many see something move at one time."""
-    counts: dict[float, int] = {}  # of cameras that see something move, by time
-    for look in looks:
-        time = round(look.view.time, 6)
-        counts[time] = counts.get(time, 0) + (look.mask is not None and bool(look.mask.mean() > SEEN))
-    cameras = float(np.median([count for count in counts.values() if count] or [0]))
+    seen = Counter(round(look.view.time, 6) for look in looks if look.mask is not None and look.mask.mean() > SEEN)
+    cameras = float(np.median(list(seen.values()) or [0]))
     advice = "aim more cameras at what moves: where less than three see it, its place in depth is a guess"
     value = f"{cameras:g} cameras see something move at one time"
-    return Measure("coverage", cameras, value, 3, math.inf, "3 or more", advice)
+    return Measure("coverage", 3, math.inf, "3 or more", advice, cameras, value)
 
 
 def spacing(cameras: Sequence[Camera], focus: Floats) -> Measure:
@@ -201,25 +195,23 @@ def spacing(cameras: Sequence[Camera], focus: Floats) -> Measure:
     advice = "put more cameras between them: so far apart none confirms the depths that another one sees, and views "
     advice += "between them, such as the held-out one, show blobs"
     value = f"{degrees:.0f} degrees from a camera to the nearest other one"
-    return Measure("spacing", degrees, value, 0, FAR_APART, f"{FAR_APART:g} or less", advice)
+    return Measure("spacing", 0, FAR_APART, f"{FAR_APART:g} or less", advice, degrees, value)
 
 
-def exposure(looks: Sequence[Look], points: Floats | None) -> Measure:
+def exposure(looks: Sequence[Look], points: Floats) -> Measure:
     """How the same points (n, 3) of the cloud change in brightness: stops between the images, 5 to 95 % of them."""
-    stops, value = UNKNOWN
-    advice = "no cloud of points, by which the same places are found in other images"
-    if points is not None:
-        levels = np.stack([_stops(look, points) for look in looks])
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # of points that no image shows
-            relative = levels - np.nanmedian(levels, axis=0)
-            gains = [np.nanmedian(row) for row in relative if np.isfinite(row).sum() >= POINTS_SEEN]
-        advice = f"less than 3 images show {POINTS_SEEN} points of the cloud"
-        if len(gains) >= 3:
-            stops = float(np.ptp(np.percentile(gains, [5, 95])))
-            value = f"changes by {stops:.2f} stops between dark and bright images"
-            advice = "lock exposure and white balance; --train corrects each image's colors"
-    return Measure("exposure", stops, value, 0, 0.3, "0.3 stops or less", advice)
+    levels = np.stack([_stops(look, points) for look in looks])
+    levels = levels[:, np.isfinite(levels).any(axis=0)]
+    levels -= np.nanmedian(levels, axis=0)
+    gains = [np.nanmedian(row) for row in levels if np.isfinite(row).sum() >= POINTS_SEEN]
+    few = f"less than 3 images show {POINTS_SEEN} points of a cloud"
+    measure = Measure("exposure", 0, 0.3, "0.3 stops or less", few)
+    if len(gains) < 3:
+        return measure
+    stops = float(np.ptp(np.percentile(gains, [5, 95])))
+    value = f"changes by {stops:.2f} stops between dark and bright images"
+    advice = "lock exposure and white balance; --train corrects each image's colors"
+    return measure._replace(number=stops, value=value, advice=advice)
 
 
 def _stops(look: Look, points: Floats) -> Floats:

@@ -22,6 +22,7 @@ from lapgs_wgpu.data.video_frames import (
 )
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.hdr import TRANSFERS, to_sdr
+from lapgs_wgpu.progress import say
 
 _FAST_BILINEAR = 0x1  # of swscale: exact enough for a thumbnail
 
@@ -48,81 +49,65 @@ def _pixels(frame: Any, size: Size, shape: Display, longer_side: int) -> Pixels:
 
 
 class Film:
-    """A film whose header was checked.
+    """A film whose header and first frame were checked.
 
     size: (width, height) of the upright frames, in pixels that are square. seconds: length as the header states it, 0
     if it does not. rate: frames a second, about. keeps_all: whether somebody chose the frames already.
     start: seconds into the film, of which the nearest frame becomes the first one.
-    notes: what the user should know of the file, one sentence each; `frames` adds to them while it decodes.
     """
 
     keeps_all = False
     start = 0.0
 
     def __init__(self, path: Path) -> None:
-        """Read the header. Raises InputError."""
+        """Read the header, and decode the first frame. Raises InputError."""
         self.path = path
-        self.notes: list[str] = []
-        if not path.is_file():
-            raise InputError(f"{path} does not exist; check its name, and the folder {path.parent.resolve()}.")
         with opened_film(path) as (file, stream):
             self._aspect = pixel_aspect(stream)
             length = stream.duration and stream.time_base and stream.duration * stream.time_base
             self.seconds = float(length or (file.duration or 0) / 1e6)  # of the container: microseconds
             self.rate = float(stream.average_rate or stream.guessed_rate or 30.0)
-            # Turned by `frames` where the first frame says so.
-            self.size: Size = _squared((stream.width, stream.height), self._aspect)
+            first = next(file.decode(stream), None)
+        if first is None:
+            raise InputError(f"{path} has no frame that can be decoded; give the recording itself.")
+        self._began = first.time or 0.0
+        self.size: Size = display(first).size(_squared((first.width, first.height), self._aspect))
+        if first.interlaced_frame:
+            say(f"{path}: {INTERLACED}.")
 
     def frames(self) -> Iterator[Frame]:
         """Decode the frames in the order of their times. Raises InputError; a film that is damaged after its first
-        frames ends there, with a note."""
+        frames ends there, which is said."""
         av = import_av(self.path)
-        number, first, last, guessed, rate, begin = 0, 0.0, -1.0, False, self.rate, None
+        number, last, begin, damaged = 0, -1.0, None, False
         with opened_film(self.path) as (file, stream):
             try:
                 for frame in file.decode(stream):
                     shape = display(frame)
                     shown = _squared((frame.width, frame.height), self._aspect)
                     size = shape.size(shown)
-                    if number == 0:
-                        self.size, first = size, frame.time or 0.0
-                        if frame.interlaced_frame:
-                            self.notes.append(f"{self.path}: {INTERLACED}.")
-                    elif size != self.size:
+                    if size != self.size:
                         raise InputError(
                             f"{self.path}: frame {number} has {size_text(size)} pixels and the first has "
                             f"{size_text(self.size)}; cut the film where its size changes."
                         )
-                    seconds = -1.0 if frame.time is None else frame.time - first
+                    seconds = -1.0 if frame.time is None else frame.time - self._began
                     if number and seconds <= last:  # no time stamp, or one that was there before
-                        guessed, seconds = True, last + 1 / rate
+                        seconds = last + 1 / self.rate
                     seconds = max(seconds, 0.0)
-                    if seconds >= self.start - 0.5 / rate:
+                    if seconds >= self.start - 0.5 / self.rate:
                         begin = seconds if begin is None else begin
                         yield Frame(seconds - begin, _gray(frame, shown, shape), partial(_pixels, frame, shown, shape))
                     number, last = number + 1, seconds
-            except av.error.FFmpegError as error:
+            except av.error.FFmpegError:
                 if number < 2:
                     raise
-                self.notes.append(
-                    f"{self.path} is damaged after {number} frames, at {last:.2f} s ({error}); what comes before is "
-                    "used."
-                )
+                damaged = True
         if number < 2:
-            raise InputError(
-                f"{self.path} has {number} frames that can be decoded, and 2 are needed at least; give the recording "
-                "itself, not its preview or a single picture."
-            )
-        if self.seconds > last + max(3 / rate, 0.1 * self.seconds):
-            self.notes.append(
-                f"{self.path} states {self.seconds:.1f} s and ends after {last:.1f} s; copy it again if the rest is "
-                "needed."
-            )
-        if guessed:
-            self.notes.append(
-                f"{self.path}: frames without a time stamp of their own are taken as {rate:g} a second; the motion is "
-                "too fast or too slow if that is wrong."
-            )
+            raise InputError(f"{self.path} has {number} frames that can be decoded, and needs 2; give the recording.")
+        if damaged or self.seconds > last + max(3 / self.rate, 0.1 * self.seconds):
+            ends = f"states {self.seconds:.1f} s and ends after {last:.1f} s"
+            say(f"{self.path} {ends}; copy it again if the rest is needed.")
 
 
 def _squared(coded: Size, aspect: float) -> Size:

@@ -27,58 +27,49 @@ MEET, MEET_SHARE = 1.5, 0.05  # pixels between a place and its way forth and bac
 
 class Motion:
     """The flow of a film. names: of its pictures. images: (h, w, 3) RGB, SIDE pixels at most, one of each picture.
-    forth, back: (h, w, 2) float16 pixels from each to the next one, and from the next one to each."""
+    flows: (h, w, 2) float16 pixels from each to the next one, and from the next one to each. grid: (rows, columns, 2)
+    the places of an image that are followed, pixels. tracks: of each image, where its grid is in the images around it,
+    by their offsets; NaN where it is lost."""
 
     def __init__(self, frames: Iterable[tuple[Pixels, bool]], names: Sequence[str]) -> None:
-        """frames: small images of equal size in order, and whether each is one of the pictures."""
-        cv2 = self._cv2 = import_cv2()
+        """frames: small images of equal size in order, the first being a picture, and whether each is one."""
+        cv2 = import_cv2()
         dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         dis.setFinestScale(1)
         self.names = names
         self.images: list[Pixels] = []
-        self.forth: list[NDArray[np.float16]] = []
-        self.back: list[NDArray[np.float16]] = []
-        self._tracks: dict[int, dict[int, Plane]] = {}
+        self.flows: list[list[NDArray[np.float16]]] = []
         before: Any = None
-        forth: Plane | None = None
-        back: Plane | None = None
+        flow: list[Plane] = []  # forth and back, from the last picture on
         with Progress(len(names), "images followed") as progress:
             for image, chosen in frames:
                 gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
                 if before is not None:
                     there, again = dis.calc(before, gray, None), dis.calc(gray, before, None)
-                    forth = there if forth is None else forth + self._moved(there, forth)
-                    back = again if back is None else again + self._moved(back, again)
-                before = gray if before is not None or chosen else None
+                    if flow:
+                        there, again = flow[0] + self._moved(there, flow[0]), again + self._moved(flow[1], again)
+                    flow = [there, again]
+                before = gray
                 if chosen:
+                    if self.images:
+                        self.flows.append([way.astype(np.float16) for way in flow])
                     self.images.append(image)
-                    if forth is not None and back is not None:
-                        self.forth.append(forth.astype(np.float16))
-                        self.back.append(back.astype(np.float16))
-                    forth = back = None
+                    flow = []
                     progress.at(len(self.images))
-
-    @property
-    def grid(self) -> Plane:
-        """(rows, columns, 2) the places of an image that are followed, pixels."""
         height, width = self.images[0].shape[:2]
-        columns, rows = np.arange(STEP // 2, width, STEP), np.arange(STEP // 2, height, STEP)
-        return np.stack(np.meshgrid(columns, rows), axis=-1).astype(np.float32)
+        places = np.meshgrid(np.arange(STEP // 2, width, STEP), np.arange(STEP // 2, height, STEP))
+        self.grid: Plane = np.stack(places, axis=-1).astype(np.float32)
+        self.tracks = [self._tracks(image) for image in range(len(self.images))]
 
-    def tracks(self, image: int) -> dict[int, Plane]:
-        """Where the grid of an image is in the images around it, by their offsets; NaN where it is lost."""
-        if image in self._tracks:
-            return self._tracks[image]
-        found = self._tracks[image] = {}
-        for way, there, again in ((1, self.forth, self.back), (-1, self.back, self.forth)):
+    def _tracks(self, image: int) -> dict[int, Plane]:
+        found = {}
+        before = [flow[::-1] for flow in self.flows[:image][::-1]]
+        for way, flows in ((1, self.flows[image:]), (-1, before)):
             at = self.grid
-            for offset in range(1, REACH + 1):
-                edge = image + way * (offset - 1) - (way < 0)
-                if not 0 <= edge < len(self.forth):
-                    break
-                step = self._at(there[edge].astype(np.float32), at)
+            for offset, (there, again) in enumerate(flows[:REACH], start=1):
+                step = self._at(there.astype(np.float32), at)
                 on = at + step
-                apart = np.linalg.norm(step + self._at(again[edge].astype(np.float32), on), axis=-1)
+                apart = np.linalg.norm(step + self._at(again.astype(np.float32), on), axis=-1)
                 on[~(apart < MEET + MEET_SHARE * np.linalg.norm(step, axis=-1))] = np.nan
                 found[way * offset] = at = on
         return found
@@ -88,7 +79,7 @@ class Motion:
         return self._at(values, ((at - STEP // 2) / STEP).astype(np.float32))
 
     def _at(self, values: Plane, at: Plane) -> Plane:
-        cv2 = self._cv2
+        cv2 = import_cv2()
         x, y = (np.ascontiguousarray(np.nan_to_num(at[..., i], nan=-9.0), dtype=np.float32) for i in (0, 1))
         return cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(np.nan,) * 4)
 

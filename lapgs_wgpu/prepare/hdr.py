@@ -34,7 +34,9 @@ def to_sdr(image: NDArray[np.uint16], transfer: Transfer) -> Pixels:
         light *= (PEAK / REFERENCE_WHITE) * np.maximum(brightness, 1e-6)[..., None] ** np.float32(0.2)
     light = np.clip(light @ TO_BT709.T.astype(np.float32), 0, None)
     strongest = light.max(axis=2, keepdims=True)
-    light *= _rolled_off(strongest) / np.maximum(strongest, 1e-6)  # of all channels alike, which keeps the hue
+    above = np.maximum(strongest - KNEE, 0) / (1 - KNEE)  # is bent, with the same slope at the knee
+    rolled_off = np.where(strongest <= KNEE, strongest, KNEE + (1 - KNEE) * above / (1 + above)).astype(np.float32)
+    light *= rolled_off / np.maximum(strongest, 1e-6)  # of all channels alike, which keeps the hue
     shown = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
     return np.floor(np.clip(shown, 0, 1) * 255 + 0.5).astype(np.uint8)
 
@@ -50,9 +52,3 @@ def _light_of_pq(signal: NDArray[np.float64]) -> NDArray[np.float64]:
     m1, m2, c1, c2, c3 = 0.1593017578125, 78.84375, 0.8359375, 18.8515625, 18.6875
     root = signal ** (1 / m2)
     return 10000 / REFERENCE_WHITE * (np.maximum(root - c1, 0) / (c2 - c3 * root)) ** (1 / m1)
-
-
-def _rolled_off(light: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Light relative to the reference white, below 1: unchanged below KNEE, then bent with the same slope there."""
-    above = np.maximum(light - KNEE, 0) / (1 - KNEE)
-    return np.where(light <= KNEE, light, KNEE + (1 - KNEE) * above / (1 + above)).astype(np.float32)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,13 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from lapgs_wgpu.data.evenly import evenly
-from lapgs_wgpu.data.images import EQUAL, Pixels, blurred, repeats, sharpness
+from lapgs_wgpu.data.images import Pixels, Size, blurred, repeats, sharpness, shrunk_size
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.film import Film, Frame
 from lapgs_wgpu.prepare.poses import import_cv2
 from lapgs_wgpu.prepare.sound import start_together
-from lapgs_wgpu.progress import Progress, say
+from lapgs_wgpu.progress import counted, say
 
 FRAMES_PER_SECOND = 10.0  # of one moving camera: poses change slowly
 STILL_FRAMES_PER_SECOND = 30.0  # of cameras on tripods, which need one pose for all their frames
@@ -30,24 +29,22 @@ JPEG_QUALITY = 95
 
 
 class Picture(NamedTuple):
-    """A written image. name: below the images' folder. seconds: since the first frame of its film. span: number of its
-    span of time, which is that of the other cameras' images of this time."""
+    """A written image. name: below the images' folder. seconds: since the first frame of its film."""
 
     name: str
     seconds: float
-    span: int = 0
 
 
 class Shape(NamedTuple):
-    """How the frames of a camera become images of one size. shrunk: longer side of the frames, pixels. cut: rows and
+    """How the frames of a camera become images of one size. shrunk: (width, height) of the frames before. cut: rows and
     columns of the shrunk frame. bent: (H, W, 2) places in the shrunk frame of the image's pixels, to undistort it."""
 
-    shrunk: int
+    shrunk: Size
     cut: tuple[slice, slice] = (slice(None), slice(None))
     bent: NDArray[np.float32] | None = None
 
     def apply(self, frame: Frame) -> Pixels:
-        image = frame.pixels(self.shrunk)
+        image = frame.pixels(max(self.shrunk))
         if self.bent is None:
             return image[self.cut]
         cv2 = import_cv2()
@@ -74,108 +71,71 @@ def extract(film: Film, images: Path, fps: float) -> list[Picture]:
     """
     pictures: list[Picture] = []
     sharp: list[float] = []
-    frames, repeated, before = 0, 0, None
-    for span in _spans(film, fps):
-        frames += span.frames
-        if before is not None and repeats(span.best.gray, before):
+    repeated, before, shape = 0, None, Shape(shrunk_size(film.size, LONGER_SIDE))
+    for _, frames in _spans(film, fps):
+        best = max(frames, key=lambda frame: sharpness(frame.gray))
+        if before is not None and repeats(best.gray, before):
             repeated += 1
             continue
-        before = span.best.gray
-        pictures.append(_write(span, span.best, images, "", Shape(LONGER_SIDE)))
-        sharp.append(span.sharpness)
-    kept = [picture for picture, soft in zip(pictures, blurred(np.array(sharp)), strict=True) if not soft]
-    for picture in set(pictures) - set(kept):
+        before = best.gray
+        pictures.append(_write(best, images, "", shape))
+        sharp.append(sharpness(best.gray))
+    soft = blurred(np.array(sharp))
+    for picture in itertools.compress(pictures, soft):
         (images / picture.name).unlink()
+    kept = list(itertools.compress(pictures, ~soft))
+    told = f"{film.path}: {len(kept)} images, the sharpest frame of each {1 / fps:.2g} s; left out: {repeated} "
+    told += f"repeated, {len(pictures) - len(kept)} blurred"
     if len(kept) < 2:
-        advice = f"nothing moves in it, by more than {EQUAL} of 255 levels: give the part of the recording that does"
-        if not repeated:
-            advice = f"it is {film.seconds:.2g} s long: give a longer one, or a larger --fps"
-        raise InputError(
-            f"{film.path} gives {len(kept)} images at {fps:g} a second ({frames} frames, of which {repeated} repeat "
-            f"another); {advice}."
-        )
-    _tell(film, f"{len(kept)} images of {frames} frames, the sharpest of each {1 / fps:.2g} s; left out: {repeated} "
-                f"repeated, {len(pictures) - len(kept)} blurred")  # fmt: skip
+        raise InputError(f"{told}; give a longer recording, a part in which something moves, or a larger --fps.")
+    say(told)
     return kept
 
 
-def extract_in_step(films: Sequence[Film], images: Path, fps: float, shapes: Sequence[Shape]) -> list[list[Picture]]:
-    """Write the images of cameras that stand still, below cam00, cam01, ...: as many of each, of the same times.
+def extract_in_step(
+    films: Sequence[Film], images: Path, fps: float, shapes: Sequence[Shape]
+) -> list[dict[int, Picture]]:
+    """Write the images of cameras that stand still, below cam00, cam01, ...: by the number of their span of time, which
+    is that of the other cameras' images of this time.
 
     None is left out, and all films end with the shortest.
     """
     start_together(films)
     cameras = []
     for number, (film, shape) in enumerate(zip(films, shapes, strict=True)):
-        pictures = [_write(span, span.first, images, f"cam{number:02d}/", shape) for span in _spans(film, fps)]
-        _tell(film, f"cam{number:02d}, {len(pictures)} images, one of each {1 / fps:.2g} s")
+        spans = _spans(film, fps)
+        pictures = {span: _write(next(frames), images, f"cam{number:02d}/", shape) for span, frames in spans}
+        say(f"{film.path}: cam{number:02d}, {len(pictures)} images, one of each {1 / fps:.2g} s")
         cameras.append(pictures)
-    ends = [pictures[-1].seconds for pictures in cameras]
-    if max(ends) > min(ends) + 1 / fps:
-        say(f"the films are {min(ends):.2f} to {max(ends):.2f} s long; all are cut to {min(ends):.2f} s.")
-    for pictures in cameras:
-        while pictures[-1].seconds > min(ends) + 0.5 / fps:
-            (images / pictures.pop().name).unlink()
+    last = min(map(max, cameras))
+    longer = [(pictures, span) for pictures in cameras for span in pictures if span > last]
+    if longer:
+        say(f"the films are not equally long: all are cut to {last / fps:.2f} s.")
+    for pictures, span in longer:
+        (images / pictures.pop(span).name).unlink()
     return cameras
 
 
-def common_times(cameras: Sequence[Sequence[Picture]], most: int) -> list[tuple[Picture, ...]]:
-    """At most `most` times that all cameras filmed, in order: a picture of each camera."""
-    of_span = [{picture.span: picture for picture in pictures} for pictures in cameras]
-    shared = sorted(set.intersection(*(set(own) for own in of_span)))
-    return [tuple(own[span] for own in of_span) for span in evenly(shared, most)]
+def _spans(film: Film, fps: float) -> Iterator[tuple[int, Iterator[Frame]]]:
+    """The number of each 1 / fps seconds of a film, and its frames. Raises InputError for a film that is black."""
+    return itertools.groupby(_lit(film), lambda frame: math.floor(frame.seconds * fps + 1e-3))  # stamps are rounded
 
 
-@dataclass
-class _Span:
-    """The frames of one span of time: the first and the sharpest of them, how sharp that is, and their number."""
-
-    number: int
-    first: Frame
-    best: Frame
-    sharpness: float
-    frames: int = 1
-
-
-def _spans(film: Film, fps: float) -> Iterator[_Span]:
-    """The frames of each 1 / fps seconds; only two of a span are kept, whatever the film's length.
-
-    Raises InputError for a film that is black.
-    """
-    number, span, brightest = -1, None, 0.0
-    with Progress(max(1, math.ceil(film.seconds)), f"seconds of {film.path.name}") as progress:
-        for frame in film.frames():
-            brightest = max(brightest, float(frame.gray.mean()))
-            value = sharpness(frame.gray)
-            now = math.floor(frame.seconds * fps + 1e-3)  # 1 ms of 1 s: stamps are rounded
-            if span is None or now > number:
-                if span is not None:
-                    yield span
-                    if math.floor(frame.seconds) > math.floor(span.first.seconds):
-                        progress.at(math.floor(frame.seconds))
-                number, span = now, _Span(now, frame, frame, value)
-                continue
-            if value > span.sharpness:
-                span.best, span.sharpness = frame, value
-            span.frames += 1
+def _lit(film: Film) -> Iterator[Frame]:
+    brightest = 0.0
+    for frame in counted(film.frames(), max(1, round(film.seconds * film.rate)), f"frames of {film.path.name}"):
+        brightest = max(brightest, float(frame.gray.mean()))
+        yield frame
     if brightest < BLACK:
         raise InputError(
             f"{film.path} is black: its brightest frame has a mean of {brightest:.1f} of 255 levels, and {BLACK:g} are "
             "needed; film with more light."
         )
-    if span is not None:
-        yield span
 
 
-def _write(span: _Span, frame: Frame, images: Path, prefix: str, shape: Shape) -> Picture:
+def _write(frame: Frame, images: Path, prefix: str, shape: Shape) -> Picture:
     """Write a JPEG image. prefix: of its name, such as "cam00/"."""
     name = f"{prefix}{frame.name or f'{round(1000 * frame.seconds):08d}'}.jpg"
     (images / name).parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(shape.apply(frame)).save(images / name, quality=JPEG_QUALITY, subsampling=0, exif=frame.exif)
-    return Picture(name, frame.seconds, span.number)
-
-
-def _tell(film: Film, what: str) -> None:
-    say(f"{film.path}: {what}")
-    for note in film.notes:
-        say(note)
+    return Picture(name, frame.seconds)

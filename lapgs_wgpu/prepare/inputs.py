@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import sys
 import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -13,16 +11,18 @@ from importlib import import_module
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import Image, ImageOps
 
-from lapgs_wgpu.data.images import SUFFIXES, THUMBNAIL, Pixels, check_image, shrink, shrunk_size, size_text
+from lapgs_wgpu.data.images import SUFFIXES, THUMBNAIL, Pixels, shrink, shrunk_size, size_text
 from lapgs_wgpu.data.stamps import ImageName, natural_key
 from lapgs_wgpu.data.timestamps import TIMES, read_times
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.listing import is_desktop_file, listed
 from lapgs_wgpu.prepare.film import Film, Frame
+from lapgs_wgpu.progress import say
 
-IMAGE_SUFFIXES = (*SUFFIXES, ".heic", ".heif", ".hif", ".avif", ".webp", ".tif", ".tiff", ".bmp")
+HEIC_SUFFIXES = (".heic", ".heif", ".hif")
+IMAGE_SUFFIXES = (*SUFFIXES, *HEIC_SUFFIXES, ".avif", ".webp", ".tif", ".tiff", ".bmp")
 FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".m2ts", ".mpg", ".mpeg", ".wmv", ".3gp")
 HEIC = "pillow_heif"  # the module that reads it
 NUMBERED = 30.0  # images a second, where their names are numbers
@@ -37,18 +37,17 @@ class Stills(Film):
     def __init__(self, files: Sequence[Path]) -> None:
         """Read times and the first header. Raises InputError."""
         self.path = files[0].parent
-        self.notes = []
-        self._files = sorted(files, key=lambda file: natural_key(file.name))
         if len(files) < 2:
             raise InputError(f"{files[0]} is one image; give all images of the camera, or the folder that holds them.")
+        files = sorted(files, key=lambda file: natural_key(file.name))
         folder = self.path if (self.path / TIMES).is_file() else self.path.parent
-        times, source = read_times([ImageName(file.name) for file in self._files], folder)
+        times, source = read_times([ImageName(file.name) for file in files], folder)
         unit = 1.0
         if source.startswith("the frame numbers"):
             unit = 1 / NUMBERED
-            self.notes.append(f"{self.path}: numbers in the names count images of {NUMBERED:g} a second.")
+            say(f"{self.path}: numbers in the names count images of {NUMBERED:g} a second.")
         order = np.argsort(times, kind="stable")
-        self._files = [self._files[i] for i in order]
+        self._files = [files[i] for i in order]
         self._times = unit * (np.array(times)[order] - min(times))
         steps = np.diff(self._times)
         self.seconds, self.rate = float(self._times[-1]), 1 / float(min(steps[steps > 0], default=1.0))
@@ -85,13 +84,9 @@ def _opened_image(file: Path) -> Image.Image:
             exif.get_ifd(_IFD).update({} if focal is None else {_FOCAL: focal})
             upright.info["exif"] = exif.tobytes()
             return upright
-    except UnidentifiedImageError:
-        if file.suffix.lower() in (".heic", ".heif", ".hif") and HEIC not in sys.modules:
-            raise InputError(f"{file} is HEIC, whose reader is not installed: pip install pillow-heif.") from None
-        check_image(file)  # says what it is
-        raise
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise InputError(f"{file} is not a readable image ({error}); copy it again.") from None
+        need = "; HEIC needs pip install pillow-heif" if file.suffix.lower() in HEIC_SUFFIXES else ""
+        raise InputError(f"{file} is not a readable image ({error}); copy it again{need}.") from None
 
 
 def open_inputs(paths: Sequence[Path], work: Path) -> list[Film]:
@@ -99,10 +94,8 @@ def open_inputs(paths: Sequence[Path], work: Path) -> list[Film]:
     InputError."""
     named: list[Path] = []
     for path in paths:
-        pattern = not path.exists() and any(c in str(path) for c in "*?[")
-        named += [Path(name) for name in sorted(glob(str(path)), key=natural_key)] if pattern else [path]
-        if pattern and not glob(str(path)):
-            raise InputError(f"{path} matches no file; put it in quotes, and check the folder.")
+        found = sorted(glob(str(path)), key=natural_key) if not path.exists() else []
+        named += [Path(name) for name in found] or [path]
     if named and all(_is(path, IMAGE_SUFFIXES) and path.is_file() for path in named):
         return [Stills(named)]
     return [camera for path in named for camera in _cameras(path, work)]
@@ -110,11 +103,10 @@ def open_inputs(paths: Sequence[Path], work: Path) -> list[Film]:
 
 def _cameras(path: Path, work: Path) -> list[Film]:
     """Of one film, folder or zip file. A folder's own images go before its films, and these before its folders."""
-    if _is(path, (".zip",)) and path.is_file():
-        path = _unpacked(path, work / path.stem)
-    if not path.is_dir():
+    folder = _unpacked(path, work / path.stem) if _is(path, (".zip",)) and path.is_file() else path
+    if not folder.is_dir():
         return [Film(path)]
-    entries = listed(path)
+    entries = listed(folder)
     if images := [entry for entry in entries if _is(entry, IMAGE_SUFFIXES)]:
         return [Stills(images)]
     if films := [entry for entry in entries if _is(entry, FILM_SUFFIXES)]:
@@ -123,7 +115,7 @@ def _cameras(path: Path, work: Path) -> list[Film]:
     inside = [entry for entry in folders if entry.name == "images"] or folders
     if not inside:
         raise InputError(f"{path} holds {len(entries)} files, none of them a film or an image; name what was recorded.")
-    return [camera for folder in sorted(inside, key=lambda f: natural_key(f.name)) for camera in _cameras(folder, work)]
+    return [camera for one in sorted(inside, key=lambda each: natural_key(each.name)) for camera in _cameras(one, work)]
 
 
 def _unpacked(path: Path, folder: Path) -> Path:
@@ -131,18 +123,10 @@ def _unpacked(path: Path, folder: Path) -> Path:
     folder.mkdir(parents=True)
     try:
         with zipfile.ZipFile(path) as file:
-            entries = [entry for entry in file.infolist() if _is(Path(entry.filename), IMAGE_SUFFIXES + FILM_SUFFIXES)]
-            size, free = sum(entry.file_size for entry in entries), shutil.disk_usage(folder).free
-            if size > free:
-                raise InputError(
-                    f"{path} holds {size / 1e9:.1f} GB, and {folder} has {free / 1e9:.1f} GB left: free some."
-                )
-            for entry in entries:
-                file.extract(entry, folder)
-    except (zipfile.BadZipFile, RuntimeError, NotImplementedError, OSError) as error:
+            names = [name for name in file.namelist() if _is(Path(name), IMAGE_SUFFIXES + FILM_SUFFIXES)]
+            file.extractall(folder, names)
+    except (zipfile.BadZipFile, RuntimeError, OSError) as error:
         raise InputError(f"{path} cannot be unpacked ({error}); copy it again, or unpack it yourself.") from None
-    if not entries:
-        raise InputError(f"{path} holds no film and no image; give a zip file of what was recorded.")
     return folder
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from lapgs_wgpu.data.images import Size, encode_png
 from lapgs_wgpu.data.masks import Mask, check_mask_size, decode_mask, find_masks
 from lapgs_wgpu.prepare.flow import REACH, Motion
-from lapgs_wgpu.prepare.poses import Floats, Match, Plane, import_cv2
+from lapgs_wgpu.prepare.poses import Floats, Plane, import_cv2
 
 NOISE, NOISE_GROWS = 0.15, 0.05  # pixels of flow, at least: between neighbouring images; for each further one
 QUARTER, MEDIAN = 25, 1.55  # percentile of the errors that tells the noise; a median of noise beside it
@@ -37,47 +37,47 @@ AROUND, INSIDE = 10, 5  # pixels around what moves, where colors decide; within 
 
 
 class Judged(NamedTuple):
-    """What a reconstruction does not explain. names: of the images. errors: (rows, columns) of the grid of each, in
-    times the noise, NaN where nothing can be said. votes: the logarithms that neighbouring images agree on; above
-    `limit` it moves. noise: pixels, between neighbouring images."""
+    """What a reconstruction does not explain. names: of the images. errors: (n, rows, columns) of their grids, in times
+    the noise, NaN where nothing can be said. votes: the logarithms that neighbouring images agree on; above `limit` it
+    moves. noise: pixels, between neighbouring images."""
 
     names: Sequence[str]
-    errors: list[Plane]
-    votes: list[Plane]
+    errors: Plane
+    votes: Plane
     limit: float
     noise: float
 
     @property
     def moving(self) -> float:
         """Share of the images' area that moves."""
-        return float(np.mean([(vote > self.limit).mean() for vote in self.votes]))
+        return float((self.votes > self.limit).mean())
 
     @property
     def followed(self) -> float:
         """Share of the area, of the images with cameras, in which flow can tell."""
-        known = [np.isfinite(errors).mean() for errors in self.errors]
-        return float(np.mean([share for share in known if share] or [0.0]))
+        known = np.isfinite(self.errors).mean(axis=(1, 2))
+        return float(known[known > 0].mean()) if known.any() else 0.0
 
     def explained(self, other: Judged) -> float:
         """How much of the images' area still points explain, in times of what they explain in another one, at the noise
         of the better of the two: what is nearly rigid fits wrong cameras nearly."""
         limit = SHARP * min(self.noise, other.noise)
-        mine, others = (float(np.mean([e * each.noise < limit for e in each.errors])) for each in (self, other))
+        mine, others = (float((each.errors * each.noise < limit).mean()) for each in (self, other))
         return mine / max(others, 1e-9)
 
     def contradicted(self) -> list[str]:
         """The images of which more than half of the known area is off by MOVES times the noise or more."""
-        pairs = zip(self.names, self.errors, strict=True)
-        return [name for name, errors in pairs if (errors > MOVES).sum() > 0.5 * max(np.isfinite(errors).sum(), 1)]
+        known = np.isfinite(self.errors).sum(axis=(1, 2))
+        off = (self.errors > MOVES).sum(axis=(1, 2)) > 0.5 * np.maximum(known, 1)
+        return [name for name, wrong in zip(self.names, off, strict=True) if wrong]
 
     def rough(self, *, turned_over: bool = False) -> dict[str, Mask]:
         """Masks on the grid, a little wider than what moves. turned_over: than what agrees, in images that disagree at
         least half as much as the worst one: their cameras may follow what moves."""
-        masks = [vote > self.limit for vote in self.votes]
+        masks = self.votes > self.limit
         if turned_over:
-            worst = max(mask.mean() for mask in masks)
-            pairs = zip(masks, self.errors, strict=True)
-            masks = [errors < SHARP if mask.mean() >= worst / 2 else mask for mask, errors in pairs]
+            share = masks.mean(axis=(1, 2), keepdims=True)
+            masks = np.where(share >= share.max() / 2, self.errors < SHARP, masks)
         wider = [import_cv2().dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0 for mask in masks]
         return dict(zip(self.names, wider, strict=True))
 
@@ -86,8 +86,7 @@ def judge(motion: Motion, model: Any) -> Judged:
     """model: a pycolmap.Reconstruction of some of the flow's images."""
     errors, noise = unexplained(motion, model)
     votes = _votes(motion, errors)
-    known = np.concatenate([vote[np.isfinite(vote)] for vote in votes])
-    limit = max(float(np.log(MOVES)), np.log(HALO) + _valley(known[known > np.log(1.5)]))
+    limit = max(float(np.log(MOVES)), np.log(HALO) + _valley(votes[votes > np.log(1.5)]))
     return Judged(motion.names, errors, votes, limit, noise)
 
 
@@ -99,14 +98,15 @@ def cut_out(motion: Motion, judged: Judged) -> dict[str, Mask]:
     return {name: _cut(image, vote, judged.limit) for name, image, vote in planes}
 
 
-def unexplained(motion: Motion, model: Any) -> tuple[list[Plane], float]:
-    """For each image the error (rows, columns) of its grid, in times the noise, NaN where nothing can be said; and the
+def unexplained(motion: Motion, model: Any) -> tuple[Plane, float]:
+    """The error (n, rows, columns) of the images' grids, in times the noise, NaN where nothing can be said; and the
     noise between neighbouring images, pixels."""
     placed = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
-    images = [placed.get(name) for name in motion.names]
-    poses: list[Any] = [None if i is None else np.vstack([i.cam_from_world().matrix(), [0, 0, 0, 1]]) for i in images]
+    number = [i for i, name in enumerate(motion.names) if name in placed]
+    poses = {i: np.vstack([placed[motion.names[i]].cam_from_world().matrix(), [0, 0, 0, 1]]) for i in number}
     points = np.stack([point.xyz for point in model.points3D.values()])
-    depths = [points @ pose[2, :3] + pose[2, 3] for pose in poses[:: max(1, len(poses) // 20)] if pose is not None]
+    every = max(1, len(motion.names) // 20)
+    depths = [points @ pose[2, :3] + pose[2, 3] for i, pose in poses.items() if i % every == 0]
     nearest = float(np.median([np.percentile(depth[depth > 0], 5) for depth in depths if (depth > 0).any()] or [1.0]))
     camera = next(iter(placed.values())).camera
     scale = camera.width / motion.images[0].shape[1]
@@ -117,26 +117,25 @@ def unexplained(motion: Motion, model: Any) -> tuple[list[Plane], float]:
         seen = np.asarray(camera.cam_from_img((flat + 0.5) * scale))
         return np.where(np.isfinite(at.reshape(-1, 2)), seen, np.nan)
 
-    def errors(i: int, noise: NDArray[np.floating]) -> tuple[Floats, list[int], Floats]:
-        tracks = {k: at for k, at in motion.tracks(i).items() if poses[i + k] is not None}
-        if poses[i] is None or len(tracks) < FEWEST:
-            return np.full(motion.grid.shape[0] * motion.grid.shape[1], np.nan), [], np.zeros((0, 0))
+    def errors(i: int, noise: NDArray[np.floating]) -> tuple[Floats, dict[int, Floats]]:
+        """Of the grid (rows columns,), in times the noise; by offset, in pixels."""
+        tracks = {k: at for k, at in motion.tracks[i].items() if i + k in poses}
+        if i not in poses or len(tracks) < FEWEST:
+            return np.full(motion.grid[..., 0].size, np.nan), {}
         relative = np.stack([poses[i + k] for k in tracks]) @ np.linalg.inv(poses[i])
         seen = np.stack([directions(at) for at in tracks.values()])
         sigma = np.array([noise[abs(k)] for k in tracks]) / focal
         total, each = depth_errors(directions(motion.grid), seen, relative, sigma, 1 / (NEAR * nearest))
-        return total, list(tracks), each * sigma[:, None] * focal
+        return total, dict(zip(tracks, each * sigma[:, None] * focal, strict=True))
 
-    least = NOISE + NOISE_GROWS * np.arange(REACH + 1)
-    samples: list[list[Floats]] = [[np.zeros(0)] for _ in least]
-    for i in range(0, len(images), max(1, len(images) // 12)):
-        _, offsets, each = errors(i, least)
-        for k, error in zip(offsets, each, strict=True):
-            samples[abs(k)].append(error[np.isfinite(error)])
-    low = [float(np.percentile(np.concatenate(s), QUARTER)) if sum(map(len, s)) else 0.0 for s in samples]
-    noise = np.maximum(least, MEDIAN * np.array(low))
-    planes = [errors(i, noise)[0].reshape(motion.grid.shape[:2]).astype(np.float32) for i in range(len(images))]
-    return planes, float(noise[1])
+    noise = NOISE + NOISE_GROWS * np.arange(REACH + 1)
+    samples = [errors(i, noise)[1] for i in range(0, len(motion.names), max(1, len(motion.names) // 12))]
+    for apart in range(1, REACH + 1):
+        found = [error[np.isfinite(error)] for each in samples for k, error in each.items() if abs(k) == apart]
+        if sum(map(len, found)):
+            noise[apart] = max(noise[apart], MEDIAN * np.percentile(np.concatenate(found), QUARTER))
+    planes = np.stack([errors(i, noise)[0] for i in range(len(motion.names))])
+    return planes.reshape(-1, *motion.grid.shape[:2]).astype(np.float32), float(noise[1])
 
 
 def depth_errors(ray: Floats, seen: Floats, relative: Floats, sigma: Floats, most: float) -> tuple[Floats, Floats]:
@@ -167,18 +166,16 @@ def depth_errors(ray: Floats, seen: Floats, relative: Floats, sigma: Floats, mos
     return np.where(known.sum(axis=0) >= FEWEST, total, np.nan), np.where(known, error, np.nan)
 
 
-def _votes(motion: Motion, errors: Sequence[Plane]) -> list[Plane]:
+def _votes(motion: Motion, errors: Plane) -> Plane:
     """The mean logarithm of the errors along each place's way, near images first."""
-    logs = [np.log(np.maximum(error, 0.5)) for error in errors]
-    result = []
+    logs, result = np.log(np.maximum(errors, 0.5)), []
     for i, own in enumerate(logs):
-        ways = {0: own} | {k: motion.on_grid(logs[i + k], at) for k, at in motion.tracks(i).items() if abs(k) <= VOTES}
+        ways = {0: own} | {k: motion.on_grid(logs[i + k], at) for k, at in motion.tracks[i].items() if abs(k) <= VOTES}
         votes = np.stack(list(ways.values()))
         weight = np.isfinite(votes) / (1.0 + np.abs(list(ways)))[:, None, None]
-        total = weight.sum(axis=0)
-        mean = (np.nan_to_num(votes) * weight).sum(axis=0) / np.maximum(total, 1e-9)
-        result.append(np.where(total > 0, mean, np.nan).astype(np.float32))
-    return result
+        with np.errstate(invalid="ignore"):  # NaN where no image tells
+            result.append((np.nan_to_num(votes) * weight).sum(axis=0) / weight.sum(axis=0))
+    return np.stack(result).astype(np.float32)
 
 
 def _valley(values: NDArray[np.floating]) -> float:
@@ -210,23 +207,6 @@ def _cut(image: NDArray[np.uint8], vote: Plane, limit: float) -> Mask:
         cv2.grabCut(image, label, None, np.zeros((1, 65)), np.zeros((1, 65)), 1, cv2.GC_INIT_WITH_MASK)
     inside = ((label == cv2.GC_FGD) | (label == cv2.GC_PR_FGD)).astype(np.uint8)
     return cv2.morphologyEx(inside, cv2.MORPH_OPEN, disk(1)) > 0
-
-
-def without(
-    matches: Match, places: Mapping[str, NDArray[np.float32]], masks: Mapping[str, Mask], size: Size
-) -> dict[tuple[str, str], Any]:
-    """The matches whose two features lie outside the masks. size: (width, height) of the images."""
-    free = {name: ~in_mask(masks.get(name), at[:, :2], size) for name, at in places.items()}
-    return {(a, b): m[free[a][m[:, 0]] & free[b][m[:, 1]]] for (a, b), m in matches.items()}
-
-
-def in_mask(mask: Mask | None, places: NDArray[np.floating], size: Size) -> Mask:
-    """Whether places (n, 2), in pixels of an image of (width, height), lie in its mask, which may be smaller."""
-    if mask is None:
-        return np.zeros(len(places), bool)
-    scale = np.array([mask.shape[1] / size[0], mask.shape[0] / size[1]])
-    column, row = np.clip((places * scale).astype(int), 0, [mask.shape[1] - 1, mask.shape[0] - 1]).T
-    return mask[row, column]
 
 
 def write_masks(folder: Path, masks: Mapping[str, Mask]) -> None:

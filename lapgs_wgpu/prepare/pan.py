@@ -10,10 +10,9 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lapgs_wgpu.data.images import Size
-from lapgs_wgpu.prepare.poses import Floats, Match
+from lapgs_wgpu.prepare.poses import Floats, Ints, Match, Plane
 
 MATCHES = 40  # of a pair of images
 SIGMA = 1.5e-3  # of the longer side: residual from which on a match counts little
@@ -35,24 +34,17 @@ class Pan(NamedTuple):
     travel: float
 
 
-class _Sample:
-    """Matches: image numbers (m,) and places (m, 2) in pixels from the middle of the image."""
+class _Sample(NamedTuple):
+    """Matches: image numbers a and b (m,), a before b, and places (m, 2) in pixels from the middle of the image."""
 
-    def __init__(
-        self, names: Sequence[str], places: Mapping[str, NDArray[np.floating]], matches: Match, size: Size
-    ) -> None:
-        number = {name: i for i, name in enumerate(names)}
-        rng, middle = np.random.default_rng(0), np.array(size) / 2
-        chosen = {pair: m[rng.permutation(len(m))[:MATCHES]].astype(np.int64) for pair, m in matches.items() if len(m)}
-        count = [len(m) for m in chosen.values()]
-        self.a = np.repeat([number[a] for a, _ in chosen], count).astype(np.int64)
-        self.b = np.repeat([number[b] for _, b in chosen], count).astype(np.int64)
-        self.at_a = np.concatenate([places[a][m[:, 0], :2] - middle for (a, _), m in chosen.items()]).astype(float)
-        self.at_b = np.concatenate([places[b][m[:, 1], :2] - middle for (_, b), m in chosen.items()]).astype(float)
+    a: Ints
+    b: Ints
+    at_a: Floats
+    at_b: Floats
 
 
 def solve_pan(
-    names: Sequence[str], places: Mapping[str, NDArray[np.floating]], matches: Match, size: Size, focal: float
+    names: Sequence[str], places: Mapping[str, Plane], matches: Match, size: Size, focal: float
 ) -> Pan | None:
     """The rotations that explain most matches, None where images share none. focal: a first guess, pixels.
 
@@ -60,7 +52,12 @@ def solve_pan(
     """
     if sum(len(m) for m in matches.values()) < 8 * len(names):
         return None
-    sample = _Sample(names, places, matches, size)
+    rng, middle, parts = np.random.default_rng(0), np.array(size) / 2, []
+    for (one, other), m in matches.items():
+        m = m[rng.permutation(len(m))[:MATCHES]]
+        ends = np.tile([names.index(one), names.index(other)], (len(m), 1))
+        parts.append((*ends.T, places[one][m[:, 0], :2] - middle, places[other][m[:, 1], :2] - middle))
+    sample = _Sample(*map(np.concatenate, zip(*parts, strict=True)))
     sigma = SIGMA * max(size)
     rotations, focal, radial, error = _refined(sample, _chained(sample, len(names), focal, sigma), focal, sigma)
     far = sample.b - sample.a >= FAR
@@ -149,13 +146,14 @@ def _refined(s: _Sample, R: Floats, focal: float, sigma: float) -> tuple[Floats,
             tried = Rotation.from_rotvec(step[:-2].reshape(n, 3)).as_matrix() @ R
             lens = focal * float(np.exp(np.clip(step[-2], -0.3, 0.3))), radial + float(step[-1])
             result = _residuals(s, tried, *lens)
-            if cost(result[2]) < now:
+            gain = now - cost(result[2])
+            if gain > 0:
                 break
             damping *= 8
         else:
             break
-        gain, (focal, radial), R = now - cost(result[2]), lens, tried
-        (ray, seen, r), now, damping = result, now - gain, max(damping / 4, 1e-7)
+        (focal, radial), R, (ray, seen, r) = lens, tried, result
+        now, damping = now - gain, max(damping / 4, 1e-7)
         if gain < 1e-5 * now:
             break
     return R, focal, radial, np.linalg.norm(r, axis=1)

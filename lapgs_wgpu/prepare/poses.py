@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import itertools
-import shutil
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_wgpu.data.images import Size
 from lapgs_wgpu.data.lens import Lens
+from lapgs_wgpu.data.masks import Mask
 from lapgs_wgpu.errors import optional_module
 from lapgs_wgpu.progress import counted
 
@@ -41,11 +40,11 @@ class Reconstruction:
     def __init__(self, images: Path, names: Sequence[str], work: Path, model: str, lenses: str = "SINGLE") -> None:
         """Raises InputError where pycolmap is not installed."""
         self._colmap = colmap = import_pycolmap()
-        self.images, self.names, self.model, self.lenses = images, list(names), model, lenses
-        self.work = work
+        self.images, self.names = images, list(names)
         self.places: dict[str, Plane] = {}
-        self._database = work / "database.db"
-        work.mkdir(parents=True, exist_ok=True)
+        self.matches: dict[Pair, Ints] = {}
+        self._database, self._models = work / "database.db", work / "models"
+        self._models.mkdir(parents=True, exist_ok=True)
         with self.database():  # makes the file
             pass
         options = colmap.ImageReaderOptions()
@@ -55,19 +54,38 @@ class Reconstruction:
             self.ids = {image.name: image.image_id for image in database.read_all_images()}
             self.cameras = {image.name: image.camera_id for image in database.read_all_images()}
             camera = database.read_all_cameras()[0]
+        self.size: Size = (camera.width, camera.height)
         self.prior, self.exif = float(camera.mean_focal_length()), bool(camera.has_prior_focal_length)
 
-    def match(self, pairs: Sequence[Pair]) -> dict[Pair, Ints]:
-        """Find the features of all images, whose places are kept, match those of pairs, and verify the matches."""
-        descriptors = {}
+    def database(self) -> Any:
+        """The open pycolmap.Database, a context manager."""
+        return self._colmap.Database.open(self._database)
+
+    def match(self, pairs: Sequence[Pair], shown: Mapping[str, Sequence[str]] | None = None) -> None:
+        """Find the features of all images, match those of pairs, keep places and matches, and verify these.
+
+        shown: names of further images, below the same folder, for cameras that stand still: an image has the features
+        of all of its own, as many for each and in the order of time, and those of one time are matched. So what moves
+        ties the cameras together, too, and the noise of several times is averaged.
+        """
+        descriptors: dict[str, list[Plane]] = {}
         with self.database() as database:
             for name in counted(self.names, len(self.names), "images searched for features"):
-                self.places[name], descriptors[name] = sift(self.images / name)
+                features = [sift(self.images / each) for each in (shown[name] if shown else [name])]
+                self.places[name] = np.concatenate([places for places, _ in features])
+                descriptors[name] = [looks for _, looks in features]
                 database.write_keypoints(self.ids[name], self.places[name])
-        numbered = counted(pairs, len(pairs), "pairs of images matched")
-        matches = {(one, other): nearest(descriptors[one], descriptors[other]) for one, other in numbered}
-        self.use(matches)
-        return matches
+        for pair in counted(pairs, len(pairs), "pairs of images matched"):
+            found, before = [], np.zeros(2, np.int64)
+            for one, other in zip(*(descriptors[name] for name in pair), strict=True):
+                found.append(nearest(one, other) + before)
+                before += [len(one), len(other)]
+            self.matches[pair] = np.concatenate(found)
+        self.use(self.matches)
+
+    def hide(self, masks: Mapping[str, Mask]) -> None:
+        """Use the matches outside masks alone."""
+        self.use(without(self.matches, self.places, masks, self.size))
 
     def use(self, matches: Match) -> None:
         """Take these matches in place of all earlier ones, and find epipolar geometries that explain many of them."""
@@ -87,14 +105,12 @@ class Reconstruction:
 
     def verified(self) -> dict[Pair, Ints]:
         """The matches that an epipolar geometry explains, of pairs that share enough of them."""
+        names = {number: name for name, number in self.ids.items()}
         with self.database() as database:
-            names, found = {number: name for name, number in self.ids.items()}, {}
-            for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
-                one, other = (names[i] for i in self._colmap.pair_id_to_image_pair(pair))
-                if len(geometry.inlier_matches) >= FEWEST_MATCHES:
-                    matches = geometry.inlier_matches.astype(np.int64)
-                    found[(one, other) if one <= other else (other, one)] = matches[:, :: 1 if one <= other else -1]
-        return found
+            geometries = zip(*database.read_two_view_geometries(), strict=True)
+            found = {self._colmap.pair_id_to_image_pair(pair): each.inlier_matches for pair, each in geometries}
+        enough = {pair: matches for pair, matches in found.items() if len(matches) >= FEWEST_MATCHES}
+        return {(names[one], names[other]): matches.astype(np.int64) for (one, other), matches in enough.items()}
 
     def solve(
         self, focal: float | None = None, *, together: bool = False, held: bool = False, seconds: float = -1
@@ -105,9 +121,7 @@ class Reconstruction:
         (GLOMAP), else one after the other, for at most so many seconds. held: the lens stays as it begins, since a wall
         or a far scene does not tell it.
         """
-        colmap, folder = self._colmap, self.work / "models"
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir()
+        colmap = self._colmap
         if focal is not None:
             with self.database() as database:
                 for camera in database.read_all_cameras():
@@ -121,11 +135,10 @@ class Reconstruction:
                 part.random_seed = SEED
             options.mapper.min_tri_angle_deg = LEAST_ANGLE
             options.mapper.track_required_tracks_per_view = 150
-            options.mapper.bundle_adjustment.ceres.solver_options.function_tolerance = 1e-4
-            if held:
-                adjustment = options.mapper.bundle_adjustment
-                adjustment.refine_focal_length = adjustment.refine_extra_params = False
-            found = colmap.global_mapping(self._database, self.images, folder, options)
+            adjustment = options.mapper.bundle_adjustment
+            adjustment.ceres.solver_options.function_tolerance = 1e-4
+            adjustment.refine_focal_length = adjustment.refine_extra_params = not held
+            found = colmap.global_mapping(self._database, self.images, self._models, options)
         else:
             options = colmap.IncrementalPipelineOptions()
             options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
@@ -136,48 +149,43 @@ class Reconstruction:
                 options.mapper.init_min_tri_angle, options.mapper.ba_local_min_tri_angle = 4, 2
                 options.mapper.filter_min_tri_angle = options.triangulation.min_angle = LEAST_ANGLE
                 options.ba_global_max_refinements, options.ba_local_max_refinements = 2, 1
-            found = colmap.incremental_mapping(self._database, self.images, folder, options)
+            found = colmap.incremental_mapping(self._database, self.images, self._models, options)
         return max(found.values(), key=lambda model: model.num_reg_images(), default=None)
 
-    def given(self, lenses: Mapping[str, Lens], poses: Mapping[str, Floats]) -> Any:
-        """A pycolmap.Reconstruction of cameras that are known, with points by the verified matches.
-
-        The model must be OPENCV. lenses: of images, at their size. poses: (4, 4), world to camera.
-        """
-        colmap, folder = self._colmap, self.work / "models"
-        model = reconstruction(lenses, poses, self.cameras, self.ids)
-        options = colmap.IncrementalPipelineOptions()
+    def given(self, cameras: Mapping[str, tuple[Lens, Floats]]) -> Any:
+        """As `unpointed`, with points by the verified matches. The model must be OPENCV."""
+        options = self._colmap.IncrementalPipelineOptions()
         options.triangulation.random_seed, options.triangulation.min_angle = SEED, LEAST_ANGLE
         options.mapper.filter_min_tri_angle = LEAST_ANGLE
-        folder.mkdir(exist_ok=True)
-        return colmap.triangulate_points(model, self._database, self.images, folder, options=options)
+        model = self.unpointed(cameras)
+        return self._colmap.triangulate_points(model, self._database, self.images, self._models, options=options)
 
-    @contextmanager
-    def database(self) -> Iterator[Any]:
-        """The open pycolmap.Database."""
-        database = self._colmap.Database.open(self._database)
-        try:
-            yield database
-        finally:
-            database.close()
+    def unpointed(self, cameras: Mapping[str, tuple[Lens, Floats]]) -> Any:
+        """A pycolmap.Reconstruction without points. cameras: of images, lenses at their size and poses (3 or 4, 4),
+        world to camera."""
+        colmap, model = self._colmap, self._colmap.Reconstruction()
+        for number, lens in {self.cameras[name]: lens for name, (lens, _) in cameras.items()}.items():
+            values = [lens.fx, lens.fy, lens.cx, lens.cy, *lens.radial[:2], *lens.tangential]
+            model.add_camera_with_trivial_rig(
+                colmap.Camera(model="OPENCV", width=lens.width, height=lens.height, params=values, camera_id=number)
+            )
+        for name, (_, pose) in cameras.items():
+            image = colmap.Image(name=name, camera_id=self.cameras[name], image_id=self.ids[name])
+            model.add_image_with_trivial_frame(image, colmap.Rigid3d(pose[:3]))
+        return model
 
 
-def reconstruction(
-    lenses: Mapping[str, Lens], poses: Mapping[str, Floats], cameras: Mapping[str, int], ids: Mapping[str, int]
-) -> Any:
-    """A pycolmap.Reconstruction without points, of images that have a pose (3 or 4, 4), world to camera. cameras, ids:
-    COLMAP's numbers of each image's camera, and of the image."""
-    colmap = import_pycolmap()
-    model = colmap.Reconstruction()
-    for number, lens in {cameras[name]: lens for name, lens in lenses.items()}.items():
-        values = [lens.fx, lens.fy, lens.cx, lens.cy, *lens.radial[:2], *lens.tangential]
-        model.add_camera_with_trivial_rig(
-            colmap.Camera(model="OPENCV", width=lens.width, height=lens.height, params=values, camera_id=number)
-        )
-    for name, pose in poses.items():
-        image = colmap.Image(name=name, camera_id=cameras[name], image_id=ids[name])
-        model.add_image_with_trivial_frame(image, colmap.Rigid3d(pose[:3]))
-    return model
+def without(matches: Match, places: Mapping[str, Plane], masks: Mapping[str, Mask], size: Size) -> dict[Pair, Ints]:
+    """The matches whose two features lie outside the masks. size: (width, height) of the images."""
+    free = {name: ~in_mask(masks[name], at[:, :2], size) for name, at in places.items()}
+    return {(a, b): m[free[a][m[:, 0]] & free[b][m[:, 1]]] for (a, b), m in matches.items()}
+
+
+def in_mask(mask: Mask, places: NDArray[np.floating], size: Size) -> Mask:
+    """Whether places (n, 2), in pixels of an image of (width, height), lie in its mask, which may be smaller."""
+    shape = np.array(mask.shape[::-1])
+    column, row = np.clip((places * (shape / size)).astype(int), 0, shape - 1).T
+    return mask[row, column]
 
 
 def sift(path: Path) -> tuple[Plane, Plane]:
@@ -227,30 +235,3 @@ def import_cv2() -> Any:
     module = optional_module("cv2", "finding and following features needs OpenCV", "prepare")
     module.setRNGSeed(0)
     return module
-
-
-def merged(source: Reconstruction, matches: Match, groups: Sequence[Sequence[str]], work: Path) -> Reconstruction:
-    """One image for each group of images of a camera that stands still: it has the features of all of them.
-
-    matches: of images of equal places in their groups, which were taken at the same time. So what moves ties the
-    cameras together, too, and the noise of several times is averaged.
-    groups: names of images, as many for each camera. The first of each stands for the camera.
-    """
-    names = [group[0] for group in groups]
-    result = Reconstruction(source.images, names, work, source.model, source.lenses)
-    first: dict[str, int] = {}  # of each image's features among those of its group
-    with result.database() as database:
-        for group in groups:
-            places = [source.places[name] for name in group]
-            first |= dict(zip(group, [0, *itertools.accumulate(len(each) for each in places)], strict=False))
-            result.places[group[0]] = np.concatenate(places)
-            database.write_keypoints(result.ids[group[0]], result.places[group[0]])
-    result.use(
-        {
-            (one[0], other[0]): np.concatenate(
-                [matches[a, b] + np.array([first[a], first[b]]) for a, b in zip(one, other, strict=True)]
-            )
-            for one, other in itertools.combinations(groups, 2)
-        }
-    )
-    return result

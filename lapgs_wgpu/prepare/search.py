@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import itertools
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from PIL import Image
 
-from lapgs_wgpu.data.images import Size
+from lapgs_wgpu.data.images import decode
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.masks import Mask
-from lapgs_wgpu.prepare.movers import without
 from lapgs_wgpu.prepare.pan import Pan, rays, solve_pan
 from lapgs_wgpu.prepare.path import path_faults
-from lapgs_wgpu.prepare.poses import Match, Reconstruction, import_pycolmap, reconstruction
+from lapgs_wgpu.prepare.poses import Reconstruction, import_pycolmap, without
 from lapgs_wgpu.progress import say
 
 FOCALS = 1.0, 1.4, 0.7  # times the width, where EXIF says nothing
@@ -25,6 +22,7 @@ GOOD, SHARP = 0.95, 1.5e-3  # the search ends: share of the images, and the mean
 SECONDS, SECONDS_EACH, CORES = 20.0, 0.6, 2  # of the search: for any film, and for each image, on so many cores
 BENT = 0.4  # first radial coefficient of a lens, at most
 PANORAMA = 3000  # points of a pan
+GAP = 2  # images in a row without a camera, at most, in one part of a film
 
 
 class Found(NamedTuple):
@@ -42,122 +40,98 @@ class Found(NamedTuple):
     held: bool = False
 
 
-def search(source: Reconstruction, size: Size, *, rival: bool = False) -> Found | None:
+def search(source: Reconstruction, *, rival: bool = False) -> Found | None:
     """The cameras that explain most images, then least implausibly, then best. None where no two images fit together.
 
-    source: with verified matches. size: (width, height) of its images. rival: whether there are other cameras to
-    compare with: then the first result with enough images ends the search.
+    source: with verified matches. rival: whether there are other cameras to compare with: then the first result with
+    enough images ends the search.
     """
-    pan = solve_pan(source.names, source.places, source.verified(), size, source.prior)
+    pan = solve_pan(source.names, source.places, source.verified(), source.size, source.prior)
     if pan is not None and pan.explained >= PURE:
-        return panned(source, pan, size)
-    focals = [source.prior, *FOCALS] if source.exif else list(FOCALS)
-    pixels = [f if source.exif and f == source.prior else f * size[0] for f in focals]
-    tries = [(f, True, False) for f in pixels[:2]] + [(pixels[0], way, True) for way in (True, False)]
-    tries += [(f, False, False) for f in pixels] + [(f, True, False) for f in pixels[2:]]
+        return panned(source, pan)
+    count, seconds = len(source.names), SECONDS + SECONDS_EACH * len(source.names)
+    focals = [source.prior] * source.exif + [focal * source.size[0] for focal in FOCALS]
+    tries = [(focal, True, False) for focal in focals[:2]] + [(focals[0], way, True) for way in (True, False)]
+    tries += [(focal, False, False) for focal in focals] + [(focal, True, False) for focal in focals[2:]]
+
+    def rank(found: Found) -> tuple[int, int, float]:
+        return round(20 * len(found.placed) / count), -len(found.faults), -found.error
+
     best: Found | None = None
-    longest, spent = 0.0, _Spent()
+    wall, processor, spent, longest = time.monotonic(), time.process_time(), 0.0, 0.0
     for number, (focal, together, held) in enumerate(tries):
-        left = SECONDS + SECONDS_EACH * len(source.names) - spent.seconds
+        left = seconds - spent
         if best is not None and left < longest:
             break
-        started = spent.seconds
-        seconds = max(left, 10) * spent.slower
-        model = source.solve(focal, together=together, held=held, seconds=seconds)
-        found = described(source, model, together=together, held=held)
-        longest = max(longest, spent.seconds - started)
-        if found is not None and (best is None or _rank(source, found) > _rank(source, best)):
-            best = found
-        if best is not None and len(best.placed) >= GOOD * len(source.names):
-            good = not best.faults and best.error < max(1.0, SHARP * max(size))
+        # COLMAP's limit is time on the wall, which what else a machine does must not shorten.
+        slower = max(1.0, (time.monotonic() - wall) / max(spent, 1.0))
+        found = _solved(source, focal, together, held, max(left, 10) * slower)
+        before, spent = spent, (time.process_time() - processor) / CORES
+        longest = max(longest, spent - before)
+        if found is not None:
+            faults = f"{len(found.faults)} faults of the path"
+            say(f"{len(found.placed)} of {count} cameras placed, {found.error:.2f} pixels off, {faults}")
+            best = max(best or found, found, key=rank)
+        if best is not None and len(best.placed) >= GOOD * count:
+            good = not best.faults and best.error < max(1.0, SHARP * max(source.size))
             if rival or (number and good):
                 break  # the first one alone may be wrong, and no measure of it tells
-        if found is not None:
-            rest = max(left + started - spent.seconds, 0) * spent.slower
-            more = f"{len(found.faults)} faults of the path; " * bool(found.faults)
-            say(
-                f"{len(found.placed)} of {len(source.names)} cameras placed, {found.error:.2f} pixels off; {more}"
-                f"looking for better ones for at most {rest:.0f} s more"
-            )
-    short = best is None or len(best.placed) < GOOD * len(source.names)
-    if pan is not None and short and pan.explained >= NEARLY:
-        return panned(source, pan, size)
-    return best
+    short = best is None or len(best.placed) < GOOD * count
+    return panned(source, pan) if pan is not None and short and pan.explained >= NEARLY else best
 
 
-class _Spent:
-    """The time of this process on CORES cores, so that what else a machine does changes no result."""
-
-    def __init__(self) -> None:
-        self._wall, self._processor = time.monotonic(), time.process_time()
-
-    @property
-    def seconds(self) -> float:
-        return (time.process_time() - self._processor) / CORES
-
-    @property
-    def slower(self) -> float:
-        """By how much time passes faster than that, at least 1."""
-        return max(1.0, (time.monotonic() - self._wall) / max(self.seconds, 1.0))
+def _solved(source: Reconstruction, focal: float, together: bool, held: bool, seconds: float) -> Found | None:
+    found = described(source, source.solve(focal, together=together, held=held, seconds=seconds))
+    return None if found is None else found._replace(together=together, held=held)
 
 
-def described(source: Reconstruction, model: Any, *, together: bool = False, held: bool = False) -> Found | None:
+def described(source: Reconstruction, model: Any) -> Found | None:
     """A reconstruction, and what tells how good it is. None where it has no points."""
     if model is None or model.num_reg_images() < 2 or not model.num_points3D():
         return None
     images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
     placed = tuple(name for name in source.names if name in images)
-    poses = np.stack([images[name].cam_from_world().matrix() for name in placed])
+    places = np.stack([images[name].projection_center() for name in placed])
+    axes = np.stack([images[name].viewing_direction() for name in placed])
     points = np.stack([point.xyz for point in model.points3D.values()])
-    faults = path_faults(-np.einsum("nij,ni->nj", poses[:, :, :3], poses[:, :, 3]), poses[:, 2, :3], points, placed)
+    faults = path_faults(places, axes, points, placed)
     camera = next(iter(model.cameras.values()))
-    if source.model == camera.model.name and abs(camera.params[3]) > BENT:
+    if camera.model.name == "RADIAL" and abs(camera.params[3]) > BENT:
         faults.append(("a lens that no camera has", 0))
     error = float(model.compute_mean_reprojection_error())
-    return Found(model, placed, tuple(faults), error, camera.mean_focal_length(), together=together, held=held)
+    return Found(model, placed, tuple(faults), error, camera.mean_focal_length())
 
 
-def panned(source: Reconstruction, pan: Pan, size: Size) -> Found:
+def panned(source: Reconstruction, pan: Pan) -> Found:
     """A pan as a reconstruction, with points of its features on a sphere of radius 1."""
-    rng = np.random.default_rng(0)
-    points, colors = [], []
-    each = max(1, PANORAMA // len(source.names))
-    for name, rotation in zip(source.names, pan.rotations, strict=True):
-        at = source.places[name][:, :2].astype(np.float64)
-        at = at[rng.permutation(len(at))[:each]]
-        ray = rays(at - np.array(size) / 2, pan.focal, pan.radial)
-        points.append(ray / np.linalg.norm(ray, axis=1, keepdims=True) @ rotation)
-        with Image.open(source.images / name) as image:
-            pixels = np.asarray(image.convert("RGB"))
-        column, row = np.clip(at.astype(int), 0, [size[0] - 1, size[1] - 1]).T
-        colors.append(pixels[row, column])
+    rng, size = np.random.default_rng(0), source.size
     lens = Lens(*size, pan.focal, pan.focal, size[0] / 2, size[1] / 2, radial=(pan.radial, 0.0, 0.0))
-    poses = {name: np.hstack([R, np.zeros((3, 1))]) for name, R in zip(source.names, pan.rotations, strict=True)}
-    model = reconstruction(dict.fromkeys(source.names, lens), poses, source.cameras, source.ids)
-    for point, color in zip(np.concatenate(points), np.concatenate(colors), strict=True):
-        model.add_point3D(point, import_pycolmap().Track(), color)
-    return Found(model, tuple(source.names), (), 0.0, pan.focal, pan)
+    rotations = dict(zip(source.names, pan.rotations, strict=True))
+    model = source.unpointed({name: (lens, np.pad(R, ((0, 0), (0, 1)))) for name, R in rotations.items()})
+    for name, rotation in rotations.items():
+        at = source.places[name][:, :2].astype(np.float64)
+        at = at[rng.permutation(len(at))[: max(1, PANORAMA // len(rotations))]]
+        ray = rays(at - np.array(size) / 2, pan.focal, pan.radial)
+        points = ray / np.linalg.norm(ray, axis=1, keepdims=True) @ rotation
+        column, row = np.clip(at.astype(int), 0, [size[0] - 1, size[1] - 1]).T
+        for point, color in zip(points, decode(source.images / name)[row, column], strict=True):
+            model.add_point3D(point, import_pycolmap().Track(), color)
+    return Found(model, tuple(rotations), (), 0.0, pan.focal, pan)
 
 
-def again(source: Reconstruction, found: Found, matches: Match, masks: Mapping[str, Mask], size: Size) -> Found | None:
-    """The cameras without what masks cover, from where the search ended. matches: all of them."""
+def again(source: Reconstruction, found: Found, masks: Mapping[str, Mask]) -> Found | None:
+    """The cameras without what masks cover, from where the search ended."""
     if found.pan is not None:
-        rest = without(source.verified(), source.places, masks, size)
-        pan = solve_pan(source.names, source.places, rest, size, found.pan.focal)
-        return None if pan is None else panned(source, pan, size)
-    source.use(without(matches, source.places, masks, size))
+        rest = without(source.verified(), source.places, masks, source.size)
+        pan = solve_pan(source.names, source.places, rest, source.size, found.pan.focal)
+        return None if pan is None else panned(source, pan)
+    source.hide(masks)
     seconds = SECONDS + SECONDS_EACH * len(source.names)
-    model = source.solve(found.focal, together=found.together, held=found.held, seconds=seconds)
-    return described(source, model, together=found.together, held=found.held)
+    return _solved(source, found.focal, found.together, found.held, seconds)
 
 
-def _rank(source: Reconstruction, found: Found) -> tuple[float, float, float]:
-    return round(20 * len(found.placed) / len(source.names)), -float(len(found.faults)), -found.error
-
-
-def longest_part(names: Sequence[str], placed: Sequence[str], gap: int) -> tuple[str, ...]:
-    """The longest run of placed images, in which at most `gap` images in a row are missing."""
+def longest_part(names: Sequence[str], placed: Sequence[str]) -> list[str]:
+    """The longest run of placed images, in which at most GAP images in a row are missing."""
     number = {name: i for i, name in enumerate(names)}
-    ends = [0, *(i for i in range(1, len(placed)) if number[placed[i]] - number[placed[i - 1]] > gap + 1), len(placed)]
-    first, last = max(itertools.pairwise(ends), key=lambda part: part[1] - part[0])
-    return tuple(placed[first:last])
+    gaps = np.diff([number[name] for name in placed])
+    return max(np.split(np.array(placed), np.flatnonzero(gaps > GAP + 1) + 1), key=len).tolist()
