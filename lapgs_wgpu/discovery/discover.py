@@ -81,8 +81,8 @@ def start_training(
             print(f"note: motion discovery is left out: {reason}.", file=sys.stderr, flush=True)
     trainer = Trainer(user_config, dataset, device, start=start, parts=parts)
     if trainer.scene.field is not None and trainer.warm_up_steps >= steps:
-        told = f"its warm-up (schedule.warm_up: {trainer.warm_up_steps} steps) is not shorter than schedule.steps ({steps})"
-        print(f"note: nothing moves in this training, since {told}.", file=sys.stderr, flush=True)
+        reason = f"schedule.steps ({steps}) must be larger than the warm-up ({trainer.warm_up_steps})"
+        print(f"note: nothing moves in this training: {reason}.", file=sys.stderr, flush=True)
     return trainer
 
 
