@@ -33,6 +33,7 @@ LENS = "RADIAL"
 FEWEST, WHOLE = 0.3, 0.9  # of the images need a pose; of fewer than this only a part of the film fits
 LITTLE, MUCH = 0.002, 0.15  # share of the images: less motion needs no masks; more may have led the cameras astray
 AGAIN = 0.98  # of the area that was explained before, at least, by cameras without what moves
+FOLLOWED = 0.8  # least share of the image area in which the flow tells whether it moves; below it, a warning
 STANDING = 4e-3  # of the longer side: the image of a camera that stands still moves less over the film
 FEATURES, SHARED = 200, 60  # of an image; in common with the next one: wanted at least
 
@@ -166,6 +167,11 @@ def _without_movers(source: Reconstruction, found: Found, motion: Motion) -> tup
             judged = judge(motion, other.model)
             if judged.explained(seen) > 1:
                 found, seen = other, judged
+    if seen.followed < FOLLOWED:
+        say(
+            f"what moves could not be looked for in {1 - seen.followed:.0%} of the image area, where nothing could be "
+            "followed from image to image: no mask covers that; film slower or with more light."
+        )
     if seen.moving > LITTLE:
         say(f"{seen.moving:.1%} of the image area moves: masked, and the cameras are placed again.")
         other = again(source, found, seen.rough())
@@ -188,9 +194,13 @@ def _refusal(source: Reconstruction, found: Found | None, folder: Path, pictures
     features = np.median([len(places) for places in source.places.values()])
     verified = source.verified()
     shared = np.median([len(verified.get(pair, ())) for pair in itertools.pairwise(source.names)])
+    advice = "film more of what stands still, mask what moves (--masks), or give the cameras of these images (--poses)"
+    if features < FEATURES:
+        advice = "film something with more texture, in focus and with more light"
+    elif shared < SHARED:
+        advice = "film slower, so that an image shows most of what the one before it shows"
     return RefusedError(
         f"{placed} of {len(source.names)} images could be placed (at least {FEWEST:.0%} are needed): an image has "
         f"{features:.0f} features (at least {FEATURES}), of which {shared:.0f} (at least {SHARED}) fit the next image; "
-        "film slower, in focus, with more light, texture and what stands still, mask what moves (--masks), or give the "
-        "images' own cameras if you gave some (--poses)."
+        f"{advice}."
     )

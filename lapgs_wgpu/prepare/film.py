@@ -79,7 +79,7 @@ class Film:
         """Decode the frames in the order of their times. Raises InputError; a film that is damaged after its first
         frames ends there, which is said."""
         av = import_av(self.path)
-        number, last, begin, damaged = 0, -1.0, None, False
+        number, last, begin, damaged, guessed = 0, -1.0, None, False, False
         with opened_film(self.path) as (file, stream):
             try:
                 for frame in file.decode(stream):
@@ -93,7 +93,7 @@ class Film:
                         )
                     seconds = -1.0 if frame.time is None else frame.time - self._began
                     if number and seconds <= last:  # no time stamp, or one that was there before
-                        seconds = last + 1 / self.rate
+                        guessed, seconds = True, last + 1 / self.rate
                     seconds = max(seconds, 0.0)
                     if seconds >= self.start - 0.5 / self.rate:
                         begin = seconds if begin is None else begin
@@ -108,6 +108,8 @@ class Film:
         if damaged or self.seconds > last + max(3 / self.rate, 0.1 * self.seconds):
             ends = f"states {self.seconds:.1f} s and ends after {last:.1f} s"
             say(f"{self.path} {ends}; copy it again if the rest is needed.")
+        if guessed:
+            say(f"{self.path}: frames without a time stamp of their own are taken as {self.rate:g} a second.")
 
 
 def _squared(coded: Size, aspect: float) -> Size:

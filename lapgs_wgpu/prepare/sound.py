@@ -23,9 +23,10 @@ def start_together(films: Sequence[Film]) -> None:
     for film, sound in zip(films, heard, strict=True):
         shift, likeness = shift_of(heard[0], sound)
         if likeness < SURE:
+            lacks = f" in common with {films[0].path.name}" if sound.any() and film is not films[0] else ""
             say(
                 f"the first frames of all {len(films)} films are taken to be of one moment: {film.path.name} has no "
-                f"sound in common with {films[0].path.name}."
+                f"sound{lacks}."
             )
             return
         shifts.append(shift)
