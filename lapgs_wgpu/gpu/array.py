@@ -83,6 +83,8 @@ class DeviceArray:
 
 def read_all(arrays: Sequence[DeviceArray]) -> list[NDArray[Any]]:
     """Read several arrays with one wait. Their offsets must be multiples of 8 bytes."""
+    if not arrays:
+        return []
     device = arrays[0].buffer.device
     places = [(array.offset, max(8, (array.nbytes + 7) & ~7)) for array in arrays]
     with translated_errors(device, "what is read back"):
