@@ -54,7 +54,7 @@ class Profile:
             writes = {"beginning_of_pass_write_index": first, "end_of_pass_write_index": first + 1}
             timed = encoder.begin_compute_pass(timestamp_writes={"query_set": self._queries, **writes})
             timed.set_pipeline(kernel.pipeline)
-            timed.set_bind_group(0, group.wgpu)
+            timed.set_bind_group(0, group)
             timed.dispatch_workgroups(columns, rows)
             timed.end()
         count = 2 * len(self._names)
