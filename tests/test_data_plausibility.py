@@ -182,23 +182,9 @@ def test_gray_of_sixteen_bits(tmp_path: Path) -> None:
     np.testing.assert_array_equal(gray_thumbnail(Path(data.train[0].source)), levels)
 
 
-@pytest.mark.parametrize(("alpha", "clear"), [(0, True), (1, True), (255, False)])
-def test_images_that_are_transparent(tmp_path: Path, alpha: int, clear: bool) -> None:
-    def write(image: NDArray[np.uint8], path: Path) -> None:
-        Image.fromarray(np.dstack([image, np.full((HEIGHT, WIDTH), alpha, np.uint8)])).save(path)
-
-    assert told(load_dataset(capture(tmp_path / "clear", write)), "nearly transparent") == clear
-
-
 def test_format_is_named_whatever_the_file_is_called(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="WebP"):
         load_dataset(capture(tmp_path / "webp", lambda i, p: Image.fromarray(i).save(p, "WEBP"), suffix="jpg"))
-
-
-@pytest.mark.parametrize("share", [0.25, 0.5, 1.0])
-def test_principal_point_of_another_size(tmp_path: Path, share: float) -> None:
-    data = load_dataset(capture(tmp_path / "other", cx=share * WIDTH, cy=share * HEIGHT))
-    assert told(data, "principal point") == (share != 0.5)
 
 
 LEFT = np.where(np.arange(WIDTH) < 20, 0, 255).astype(np.uint8) * np.ones((HEIGHT, 1), np.uint8)  # 20 columns go

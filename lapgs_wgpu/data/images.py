@@ -54,15 +54,13 @@ class ImageFile(NamedTuple):
     """An image file whose header was checked.
 
     size: (width, height) in pixels. orientation: as EXIF states it, 1 to 8; 1 is upright. deep: whether it has 16 bits
-    per channel, of which the upper 8 are read. alpha: whether it states opacities. upright: whether `read` turns it as
-    `orientation` says. source: where it comes from if not from a file of the capture, for errors.
+    per channel, of which the upper 8 are read. upright: whether `read` turns it as `orientation` says. source: where it comes from if not from a file of the capture, for errors.
     """
 
     path: Path
     size: Size
     orientation: int = 1
     deep: bool = False
-    alpha: bool = False
     upright: bool = False
     source: str = ""
 
@@ -108,7 +106,6 @@ def check_image(path: Path, *, whole: bool = True) -> ImageFile:
             exif = file.format != "PNG" or "exif" in file.info  # else Pillow would decode a PNG to look for more
             orientation = file.getexif().get(_ORIENTATION, 1) if exif else 1
             deep = file.format == "PNG" and "16" in str(file.tile[0][3])
-            alpha = _has_alpha(file)
             if whole:
                 file.verify()
     except Image.UnidentifiedImageError:
@@ -117,11 +114,7 @@ def check_image(path: Path, *, whole: bool = True) -> ImageFile:
         raise InputError(f"{path} is not a readable image ({reason}); copy or render it again.") from None
     if mode not in _MODES:
         raise InputError(f"{path} has pixels of mode {mode}; save it as RGB or RGBA with 8 bits per channel.")
-    return ImageFile(path, size, orientation if orientation in range(1, 9) else 1, deep, alpha)
-
-
-def _has_alpha(file: Image.Image) -> bool:
-    return "A" in file.getbands() or "transparency" in file.info
+    return ImageFile(path, size, orientation if orientation in range(1, 9) else 1, deep)
 
 
 def _content(path: Path) -> str:
@@ -145,7 +138,7 @@ def decode(path: Path) -> Pixels:
     """
     with _decoding(path), open(path, "rb") as file:  # not the path: imageio would look into archives
         header = Image.open(file, formats=_FORMATS)
-        transparent = _has_alpha(header)
+        transparent = "A" in header.getbands() or "transparency" in header.info
         if header.mode.startswith("I"):  # Pillow clips 16 bits of gray, and takes the upper 8 of RGB
             gray = (np.asarray(header) >> 8).astype(np.uint8)
             return np.repeat(gray[..., None], 3, axis=2)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path, PurePath
+from pathlib import Path
 
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import SUFFIXES, Pixels, Size, shrink, shrunk_size
@@ -20,7 +20,7 @@ from lapgs_wgpu.data.placement import mover_cube, place
 from lapgs_wgpu.data.readers import apps, colmap, hypernerf, panoptic, poses_bounds, transforms
 from lapgs_wgpu.data.stamps import natural_key
 from lapgs_wgpu.data.timestamps import as_one_camera, by_camera, disorder, held_out, in_step, read_times
-from lapgs_wgpu.data.validation import check_cloud, check_film, check_frames, check_plausible, check_views, upright
+from lapgs_wgpu.data.validation import check_cloud, check_depth, check_film, check_frames, check_views, upright
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
@@ -66,11 +66,11 @@ def load_dataset(
     if not undistort:
         frames = [dataclasses.replace(frame, lens=frame.lens.idealized) for frame in frames]
     frames, warnings = upright(frames)
-    warnings = [*capture.warnings, *warnings, *check_plausible(frames)]
+    warnings = [*capture.warnings, *warnings, *check_depth([frame.image for frame in frames])]
     frames, time_source = _timed(folder, dataclasses.replace(capture, frames=frames), warnings)
     check_frames(frames)
-    frames = _masked(frames, None if masks is None else Path(masks), None if movers is None else folder / movers)
-    warnings += _check_masks(frames)
+    own_masks, own_movers = None if masks is None else Path(masks), None if movers is None else folder / movers
+    frames = _masked(frames, own_masks, own_movers, warnings)
 
     capture = dataclasses.replace(capture, frames=frames)
     cameras, undistortions = _cameras(capture, shrunk_size(frames[0].image.size, image_size))
@@ -78,7 +78,7 @@ def load_dataset(
     training_cameras = list(dict.fromkeys(camera for camera, _ in training))
     if capture.cloud is not None:
         if capture.own_footage:
-            warnings += check_views(capture.cloud, cameras, [frame.name.file for frame in frames], capture.source)
+            warnings += check_views(capture.cloud, list(dict.fromkeys(cameras)), capture.source)
         cloud = check_cloud(capture.cloud, training_cameras, capture.source, warnings)
         capture = dataclasses.replace(capture, cloud=cloud)
     moving = None
@@ -125,23 +125,18 @@ def _summary(
     layout: str, capture: Capture, cameras: Sequence[Camera], time_source: str, moved: Normalization | None
 ) -> str:
     """Say how a capture was understood: layout, cameras, times and their source, what is held out, its scale."""
-    films = by_camera([frame.name for frame in capture.frames])
-    folders = len({PurePath(frame.name.file).parent for frame in capture.frames})
-    held = [frame.name.camera for frame in capture.frames if frame.split != "train"]
-    places = len(set(cameras))
-    still = len(cameras) >= 2 * places
-    number = places if still else len(films)
+    frames, places = capture.frames, len(set(cameras))
+    still = len(frames) >= 2 * places
+    number = places if still else len({frame.name.camera for frame in frames})
     told = f"{number} {'still' if still else 'moving'} camera{'s' * (number > 1)}"
-    if not still and capture.own_footage and len(films) > 1:
-        told += " that film at the same time"
-    elif not still and capture.own_footage and folders > 1:
-        told += f" in {folders} folders, one after the other"
-    whole = len(films) > 1 and len(set(held)) == 1 and len(films[held[0]]) == len(held)
-    out = f"{held[0]} is" if whole else f"{len(held)} of {len(cameras)} images are"
-    times = len({frame.time for frame in capture.frames})
+    times = len({frame.time for frame in frames})
+    held = sum(frame.split != "train" for frame in frames)
     scale = "coordinates are kept" if moved is None else f"1 unit of the files becomes {moved.scale:.4g}"
     left_out = f"; {capture.left_out} left out" if capture.left_out else ""
-    return f"{layout}, {told}, {times} times from {time_source}; {out} held out; {scale}{left_out}"
+    return (
+        f"{layout}, {told}, {times} times from {time_source}; {held} of {len(frames)} images are held out; "
+        f"{scale}{left_out}"
+    )
 
 
 def _reader(folder: Path) -> Reader:
@@ -158,8 +153,6 @@ def _reader(folder: Path) -> Reader:
     children = sorted(child for child in folder.iterdir() if child.is_dir())
     scenes = [child.name for child in children if any(reader.matches(child) for reader in READERS)]
     inside = f"; it holds the scenes {', '.join(scenes[:8])}: name one of them" if scenes else ""
-    if any(reader.matches(folder.resolve().parent) for reader in READERS):
-        inside = f"; its parent folder {folder.resolve().parent} is one: name that"
     held = {path.suffix.lower() for pattern in ("*.*", "*/*.*") for path in folder.glob(pattern)}
     if not inside and not held.isdisjoint((*SUFFIXES, *FILMS)):
         inside = (
@@ -194,9 +187,9 @@ def _timed(folder: Path, capture: Capture, warnings: list[str]) -> tuple[list[Fr
     return [dataclasses.replace(f, name=name, time=time, split=split) for f, name, time, split in found], source
 
 
-def _masked(frames: Sequence[Frame], masks: Path | None, movers: Path | None) -> list[Frame]:
+def _masked(frames: Sequence[Frame], masks: Path | None, movers: Path | None, warnings: list[str]) -> list[Frame]:
     """Give training frames the masks in the user's folder, in place of those that the capture names, and all frames
-    those of what moves."""
+    those of what moves. Appends warnings. Raises InputError."""
     if masks is not None:
         names = [frame.name.file for frame in frames if frame.split == "train"]
         found = find_masks(masks, names, "each training image, named as the image")
@@ -204,14 +197,11 @@ def _masked(frames: Sequence[Frame], masks: Path | None, movers: Path | None) ->
     if movers is not None:
         found = find_masks(movers, [frame.name.file for frame in frames], "each image, white where it moves")
         frames = [dataclasses.replace(frame, moving=found[frame.name.file]) for frame in frames]
-    return list(frames)
-
-
-def _check_masks(frames: Sequence[Frame]) -> list[str]:
     size, kind = frames[0].image.size, frames[0].mask_kind
-    ignored = {frame.name.file: frame.mask for frame in frames if frame.split == "train" and frame.mask is not None}
-    moving = {frame.name.file: frame.moving for frame in frames if frame.moving is not None}
-    return check_masks(ignored, size, kind) + check_masks(moving, size, "white", movers=True)
+    ignored = [frame.mask for frame in frames if frame.split == "train" and frame.mask is not None]
+    moving = [frame.moving for frame in frames if frame.moving is not None]
+    warnings += check_masks(ignored, size, kind, "is left out") + check_masks(moving, size, "white", "moves")
+    return list(frames)
 
 
 def _cameras(capture: Capture, size: Size) -> tuple[list[Camera], dict[Lens, Undistortion]]:

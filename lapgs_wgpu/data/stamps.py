@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import PurePosixPath
 from typing import NamedTuple
@@ -22,7 +22,6 @@ _CLOCK = re.compile(  # 20260110_095848, 2026-01-10 at 9.58.48 PM, 09-58-48; dig
     r"(?P<hour>\d\d|(?<!\d)\d(?=[-_.:]))(?P<by>[-_.:]?)(?P<minute>\d\d)(?P=by)(?P<second>\d\d)"
     r"(?:[-_.]?(?P<part>\d{3}|\d{6}))?(?!\d)(?:\s?(?P<half>[AaPp])[Mm]\b)?"
 )
-_UNIX = re.compile(r"(?<!\d)(1\d{9})[-_.](\d{3,9})(?!\d)")
 _DECIMAL = re.compile(r"(?:(?<![\w.])|(?<=[_-]))(\d+(?:\.(\d+))?)s?(?![\w.])")  # 0.25, t_0.25, 0.25s
 _DAY = 86400.0  # seconds
 
@@ -139,15 +138,15 @@ def stand_still(names: Iterable[ImageName], places: Mapping[str, NDArray[np.floa
 
 
 def clock_times(names: Sequence[ImageName]) -> tuple[list[float], str] | None:
-    """Return the times in seconds that all names state, and what they are; None if these are no clock times, Unix
-    times or decimals, or if two images of a camera have the same.
-    """
-    stamps = [name.stamp for name in names]
+    """Return the times in seconds that all names state, and what they are; None if these are neither clock times nor
+    decimals, or if two images of a camera have the same."""
+    matches = [match for name in names if (match := _CLOCK.search(name.stamp))]
+    clocks = [seconds for match in matches if (seconds := _seconds(match)) is not None]
+    dated = {match["date"] is not None for match in matches} if len(clocks) == len(names) else set()
     readings = (
-        (_of_each(stamps, _date), "clock times"),
-        (_of_each(stamps, _unix_seconds), "Unix times"),
-        (_times_of_day(names), "clock times (HHMMSS)"),
-        (_decimals(stamps), "seconds"),
+        (clocks if dated == {True} else None, "clock times"),
+        (_times_of_day(names, matches, clocks) if dated == {False} else None, "clock times (HHMMSS)"),
+        (_decimals([name.stamp for name in names]), "seconds"),
     )
     for seconds, kind in readings:
         if seconds and len({(name.camera, time) for name, time in zip(names, seconds, strict=True)}) == len(names) > 1:
@@ -155,38 +154,27 @@ def clock_times(names: Sequence[ImageName]) -> tuple[list[float], str] | None:
     return None
 
 
-def _of_each(stamps: Sequence[str], read: Callable[[str], float | None]) -> list[float] | None:
-    seconds = [value for value in map(read, stamps) if value is not None]
-    return seconds if len(seconds) == len(stamps) else None
-
-
-def _date(stamp: str) -> float | None:
-    if not (found := _CLOCK.search(stamp)) or found["date"] is None or (clock := _time_of_day(found)) is None:
-        return None
-    try:
-        day = datetime.strptime(re.sub(r"\D", "", found["date"]), "%Y%m%d").replace(tzinfo=UTC)
-    except ValueError:  # 20261399_000001
-        return None
-    return day.timestamp() + clock
-
-
-def _time_of_day(found: re.Match[str]) -> float | None:
-    """Seconds from midnight of a match of _CLOCK; None where it is no time of day."""
+def _seconds(found: re.Match[str]) -> float | None:
+    """Seconds of a match of _CLOCK, from its midnight where it has no date; None where it is no possible time."""
     hour, minute, second = (int(found[part]) for part in ("hour", "minute", "second"))
     if found["half"]:
         hour = hour % 12 + 12 * (found["half"] in "Pp")
+    try:
+        midnight = datetime.strptime(re.sub(r"\D", "", found["date"] or "19700101"), "%Y%m%d").replace(tzinfo=UTC)
+    except ValueError:  # 20261399_000001
+        return None
     possible = hour < 24 and minute < 60 and second < 60
-    return 3600 * hour + 60 * minute + second + float(f"0.{found['part'] or 0}") if possible else None
+    clock = 3600 * hour + 60 * minute + second + float(f"0.{found['part'] or 0}")
+    return midnight.timestamp() + clock if possible else None
 
 
-def _times_of_day(names: Sequence[ImageName]) -> list[float] | None:
-    """Seconds of HHMMSS without a date, also past midnight; None unless all are possible times of day, alike in all
-    else that the names of a camera hold, and more even as times than as numbers, which jump by 40 each minute."""
-    found = [_CLOCK.search(name.stamp) for name in names]
-    matches = [match for match in found if match and match["date"] is None]
-    clocks = [clock for match in matches if (clock := _time_of_day(match)) is not None]
+def _times_of_day(
+    names: Sequence[ImageName], matches: Sequence[re.Match[str]], clocks: Sequence[float]
+) -> list[float] | None:
+    """Seconds of HHMMSS without a date, also past midnight; None unless they are alike in all else that the names of a
+    camera hold, and more even as times than as numbers, which jump by 40 each minute."""
     around = {(name.camera, _CLOCK.sub("", name.stamp, count=1)) for name in names}
-    if len(clocks) < len(names) or len(around) > len({name.camera for name in names}):
+    if len(around) > len({name.camera for name in names}):
         return None
     times = np.array(clocks)
     ordered = np.sort(times)
@@ -201,11 +189,6 @@ def _unevenness(values: NDArray[np.float64]) -> float:
     """The largest step between ascending values, in usual ones."""
     steps = np.diff(np.unique(values))
     return float(steps.max() / np.median(steps)) if len(steps) else 0.0
-
-
-def _unix_seconds(stamp: str) -> float | None:
-    found = _UNIX.search(stamp)
-    return float(f"{found[1]}.{found[2]}") if found else None
 
 
 def _decimals(stamps: Sequence[str]) -> list[float] | None:

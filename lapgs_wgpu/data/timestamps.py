@@ -112,12 +112,12 @@ def frame_numbers(names: Sequence[ImageName]) -> list[int]:
     for mine in by_camera(names).values():
         files = [names[i].file for i in mine]
         rows = [[int(digits) for digits in re.findall(r"\d+", names[i].stamp)] for i in mine]
-        fewest, most = (choose(range(len(rows)), key=lambda i: len(rows[i])) for choose in (min, max))
-        if not rows[fewest] or len(rows[fewest]) < len(rows[most]):
-            other = f"it has {len(rows[fewest])} and {files[most]} has {len(rows[most])}"
+        counts = sorted((len(row), file) for row, file in zip(rows, files, strict=True))
+        (fewest, one), (most, other) = counts[0], counts[-1]
+        if not fewest or fewest < most:
             raise InputError(
-                f"the name {files[fewest]} does not state a frame number: "
-                f"{other if rows[most] else 'it has no numbers'}; write the times into {TIMES}, or number the frames."
+                f"{one} has {fewest} numbers in its name and {other} has {most}, so no frame number is told; write the "
+                f"times into {TIMES}, or number the frames."
             )
         varying = [column for column in range(len(rows[0])) if len({row[column] for row in rows}) > 1]
         if len(varying) > 1:  # a counter beside a clock of seconds, which repeats itself
@@ -131,15 +131,14 @@ def frame_numbers(names: Sequence[ImageName]) -> list[int]:
                 f"the times into {TIMES}, or put the images of each camera into a folder of their own."
             )
         column = varying[0] if varying else len(rows[0]) - 1
-        numbers: dict[int, str] = {}
+        first: dict[int, str] = {}
         for i, file, row in zip(mine, files, rows, strict=True):
             found[i] = row[column]
-            if row[column] in numbers:
+            if (before := first.setdefault(row[column], file)) != file:
                 raise InputError(
-                    f"{file} has the frame number {row[column]}, as {numbers[row[column]]} has; rename one, or "
-                    "put the images of each camera into a folder of their own."
+                    f"{file} has the frame number {row[column]}, as {before} has; rename one, or put the images of "
+                    "each camera into a folder of their own."
                 )
-            numbers[row[column]] = file
     return found
 
 
@@ -165,24 +164,15 @@ def disorder(names: Sequence[ImageName], times: Sequence[float], *, numbered: bo
                     "the times, or the numbers."
                 )
     spans = {camera: (min(times[i] for i in mine), max(times[i] for i in mine)) for camera, mine in cameras.items()}
-    (first_camera, (a, b)), *others = spans.items()
-    for other, (c, d) in others:
-        if c > b or d < a:
-            return [
-                *warnings,
-                f"cameras film at different times: {first_camera} from {a:g} to {b:g} and {other} from {c:g} to {d:g}; "
-                "if they filmed together, give their times, or numbers, from a common moment on.",
-            ]
     step = max(time_step(np.unique([times[i] for i in mine])) for mine in cameras.values())
     longest = max(1.5 * step, APART * (max(times) - min(times)))
-    advice = f"; if some film more images a second, or were started apart, write the times in seconds into {TIMES}"
-    for word, ends in zip(("begin", "end"), zip(*spans.values(), strict=True), strict=True):
-        if max(ends) - min(ends) > longest:
-            at: dict[float, list[str]] = {}
-            for camera, end in zip(spans, ends, strict=True):
-                at.setdefault(end, []).append(camera)
-            told = (f"{', '.join(some[:4])}{' ...' * (len(some) > 4)} at {end:g}" for end, some in at.items())
-            warnings.append(f"cameras {word} at different times: {', '.join(told)}{advice if numbered else ''}.")
+    if any(max(ends) - min(ends) > longest for ends in zip(*spans.values(), strict=True)):
+        first_camera, (a, b) = next(iter(spans.items()))
+        other, (c, d) = max(spans.items(), key=lambda item: max(abs(item[1][0] - a), abs(item[1][1] - b)))
+        warnings.append(
+            f"cameras film at different times: {first_camera} from {a:g} to {b:g} and {other} from {c:g} to {d:g}; if "
+            f"some film more images a second, or were started apart, write the times in seconds into {TIMES}."
+        )
     return warnings
 
 

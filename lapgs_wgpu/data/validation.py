@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.capture_files import MOST_ABSENT
 from lapgs_wgpu.data.cloud import Cloud, in_view, views_of
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.focus import FAR_APART, degrees_apart, spread
@@ -28,9 +27,7 @@ from lapgs_wgpu.splat.camera import Camera
 MIN_FOCAL, MAX_FOCAL = 0.05, 1000.0  # of an image's longer side: 169 and 0.06 degrees of view
 # A triangulated point was seen by cameras. If most points are not, cloud and cameras use different coordinates.
 MIN_SEEN = 0.5
-OFF_CENTER = 0.15  # of a side: intrinsics of images half or twice as large lie 0.25 or 0.5 away from the middle
 LOOKED_AT, DARK = 8, 64  # images of 16 bits that are decoded, and the level that a bright one of them reaches
-BLACK_AT, BLACK = 3, 16  # images of a camera that are decoded, and the level that one of them reaches
 MIN_SPREAD = 1e-3  # of the cloud, relative to its distance from the cameras: a smaller one covers less than a pixel
 NAMED = 5  # images that a warning names
 STANDING = 0.01  # cameras with a spread below this, relative to their distance from the cloud, have no parallax
@@ -60,58 +57,18 @@ def upright(frames: Sequence[Frame]) -> tuple[list[Frame], list[str]]:
     ]
 
 
-def check_plausible(frames: Sequence[Frame]) -> list[str]:
-    """Warn about principal points far from the image's middle, and about images that are nearly black or transparent:
-    those of 16 bits that use fewer, and those with alpha."""
-    warnings = []
-    off = {frame.lens: frame.where for frame in reversed(frames) if _is_off_center(frame.lens)}
-    if off:
-        lens, where = next(reversed(off.items()))
-        warnings.append(
-            f"{where}: the principal point ({lens.cx:.5g}, {lens.cy:.5g}) is far from the middle of images of "
-            f"{size_text(lens.size)}, in {len(off)} cameras; unless the images were cut out of larger ones, the "
-            "intrinsics are those of another size, or in other units than pixels."
-        )
-    images = [frame.image for frame in frames]
-    deep, transparent = [image for image in images if image.deep], [image for image in images if image.alpha]
-    if told := _low_levels(deep, slice(3), "images of 16 bits are nearly black", "level"):
-        text, highest = told
-        bits = highest.bit_length()
-        warnings.append(f"{text}, so they seem to use {8 + bits} bits; multiply them by {2 ** (8 - bits)}.")
-    if told := _low_levels(transparent, slice(3, 4), "images are nearly transparent", "alpha"):
-        warnings.append(f"{told[0]}, and transparent pixels count as background; save the images without alpha.")
-    return warnings + _black_cameras(frames)
-
-
-def _is_off_center(lens: Lens) -> bool:
-    return max(abs(lens.cx / lens.width - 0.5), abs(lens.cy / lens.height - 0.5)) > OFF_CENTER
-
-
-def _black_cameras(frames: Sequence[Frame]) -> list[str]:
-    by_camera = dict[str, list[ImageFile]]()
-    for frame in frames:
-        if frame.name.camera and isinstance(frame.image, ImageFile) and not frame.image.deep:
-            by_camera.setdefault(frame.name.camera, []).append(frame.image)
-    several = {name: evenly(images, BLACK_AT) for name, images in by_camera.items() if len(images) > 1}
-    black = [name for name, images in several.items() if all(decode(i.path)[..., :3].max() < BLACK for i in images)]
-    if not black:
-        return []
-    advice = "leave them out" if len(several) > 1 else "give brighter images"
-    looked_at = several[black[0]]
-    return [
-        f"{len(black)} of {len(several)} cameras are black, such as {black[0]}: in {len(looked_at)} of its "
-        f"{len(by_camera[black[0]])} images, such as {looked_at[0]}, no level reaches {BLACK}: {advice}."
-    ]
-
-
-def _low_levels(images: Sequence[ImageFile], channels: slice, what: str, of: str) -> tuple[str, int] | None:
-    """Begin a warning, and return the highest level, where some channels of all images that are looked at are dark."""
-    looked_at = evenly(images, LOOKED_AT)
-    highest = max((int(decode(image.path)[..., channels].max()) for image in looked_at), default=255)
+def check_depth(images: Sequence[ImageFile]) -> list[str]:
+    """Warn about images of 16 bits that are nearly black, since they use fewer."""
+    deep = [image for image in images if image.deep]
+    looked_at = evenly(deep, LOOKED_AT)
+    highest = max((int(decode(image.path)[..., :3].max()) for image in looked_at), default=255)
     if highest >= DARK:
-        return None
-    told = f"{what}: in {len(looked_at)} of {len(images)}, such as {looked_at[0]}, no {of} is above {highest} of 255"
-    return told, highest
+        return []
+    bits = highest.bit_length()
+    return [
+        f"images of 16 bits are nearly black: in {len(looked_at)} of {len(deep)}, such as {looked_at[0]}, no level is "
+        f"above {highest} of 255, so they seem to use {8 + bits} bits; multiply them by {2 ** (8 - bits)}."
+    ]
 
 
 def check_frames(frames: Sequence[Frame]) -> None:
@@ -140,11 +97,9 @@ def _check_lens(frame: Frame) -> None:
                 f"{MIN_FOCAL:g} to {MAX_FOCAL:g} times the longer side, in pixels of that size."
             )
     if not scales_to(size, lens.size):
-        sideways = scales_to(size[::-1], lens.size)
-        advice = "turn it, or give the camera of the turned image" if sideways else "give the camera of this image"
         raise InputError(
-            f"{frame.image} is {size_text(size)} pixels, but {where} states {stated}, which has other proportions"
-            f"{', those of the image on its side' if sideways else ''}; {advice}."
+            f"{frame.image} is {size_text(size)} pixels, but {where} states {stated}, which has other proportions; "
+            "give the camera of this image, or turn it if it lies on its side."
         )
 
 
@@ -226,28 +181,16 @@ def _gaps(dataset: Dataset, source: str) -> list[str]:
     ]
 
 
-def check_in_view(dataset: Dataset, points: NDArray[np.floating]) -> list[str]:
-    """Warn about times at which no training view shows the scene.
-
-    points: (N, 3) means of the initial Gaussians, world units. Raises InputError if no view shows any.
-    """
-    seen = {camera: bool(in_view(points, camera)[1].any()) for camera in dataset.cameras}
-    if not any(seen.values()):
-        low, high = points.min(axis=0), points.max(axis=0)
-        box = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(low, high, strict=True))
-        raise InputError(
-            f"{dataset.name}: none of {len(dataset.train)} training cameras sees where the first Gaussians lie ({box} "
-            "along x, y, z); check the poses and their axes, or raise points.box and field.bound."
-        )
-    shown = {view.time for view in dataset.train if seen[view.camera]}
-    blind = [view for view in dataset.train if view.time not in shown]
-    if not blind:
-        return []
-    return [
-        f"{dataset.name}: all cameras look away at {len({view.time for view in blind})} of {len(dataset.times)} times: "
-        f"{_named([view.name for view in blind])} show nothing of the scene, so its motion there is a guess; check "
-        "these poses, or remove these images."
-    ]
+def check_in_view(dataset: Dataset, points: NDArray[np.floating]) -> None:
+    """Raise InputError if no training view shows any of the initial Gaussians' means (N, 3), world units."""
+    if any(in_view(points, camera)[1].any() for camera in dataset.cameras):
+        return
+    low, high = points.min(axis=0), points.max(axis=0)
+    box = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(low, high, strict=True))
+    raise InputError(
+        f"{dataset.name}: none of {len(dataset.train)} training cameras sees where the first Gaussians lie ({box} "
+        "along x, y, z); check the poses and their axes, or raise points.box and field.bound."
+    )
 
 
 def check_spacing(dataset: Dataset) -> list[str]:
@@ -262,30 +205,19 @@ def check_spacing(dataset: Dataset) -> list[str]:
     ]
 
 
-def check_views(cloud: Cloud, cameras: Sequence[Camera], names: Sequence[str], where: Path) -> list[str]:
-    """Warn about cameras that see no point of the cloud or hardly move, and about a sparse cloud.
+def check_views(cloud: Cloud, cameras: Sequence[Camera], where: Path) -> list[str]:
+    """Warn about cameras that hardly move, and about a sparse cloud.
 
-    cameras, names: of each image, in the coordinates of the cloud; a camera counts once, by its first image's name.
-    Raises InputError if more than half of the cameras see no point.
+    cameras: the distinct ones, in the coordinates of the cloud. Raises InputError if more than half see no point.
     """
-    first_name = dict(zip(reversed(cameras), reversed(names), strict=True))
-    cameras = list(dict.fromkeys(cameras))
     points = cloud.points.astype(np.float64)
-    blind = [first_name[camera] for camera in cameras if not views_of(points, [camera]).any()]
-    if 2 * len(blind) > len(cameras):
-        back = [Camera(c.K, np.diag([1.0, -1, -1, 1]) @ c.T_cam_world, c.width, c.height) for c in cameras]
-        turned = float(np.mean([views_of(points, [camera]).any() for camera in back]))
-        hint = f"; turned round, {100 * turned:.0f} % of them would see some: {AXES_HINT}" if turned > 0.5 else ""
+    blind = sum(not in_view(points, camera)[1].any() for camera in cameras)
+    if 2 * blind > len(cameras):
         raise InputError(
-            f"{where}: cameras look away from the cloud: {len(blind)} of {len(cameras)} see none of its {len(points)} "
-            f"points{hint or '; cloud and cameras have different coordinates or scales'}."
+            f"{where}: cameras look away from the cloud: {blind} of {len(cameras)} see none of its {len(points)} "
+            f"points; {AXES_HINT}, or cloud and cameras have different coordinates or scales."
         )
     warnings = []
-    if blind:
-        warnings.append(
-            f"cameras look away from the cloud: {_named(blind)} see none of its {len(points)} "
-            f"points ({len(blind)} of {len(cameras)} cameras); their poses may be wrong."
-        )
     if len(points) < FEW_POINTS:
         warnings.append(
             f"the cloud is sparse: {where} holds {len(points)} points (at least {FEW_POINTS} are usual); more texture, "
@@ -306,20 +238,14 @@ def check_film(images: Sequence[Path]) -> list[str]:
     """Warn about images of one camera, in the order of time, that are blurred or repeated."""
     if len(images) < 3:
         return []
-    blurry, repeated = ([image.name for image in bad] for bad in blurred_and_repeated(images))
+    blurry, repeated = blurred_and_repeated(images)
     found = (
         ("blurred", blurry, f"have less than {BLURRED:g} of their neighbours' sharpness"),
         ("repeated", repeated, f"differ by at most {EQUAL} of 255 levels from the one before: motion stands still"),
     )
-    # Where so many are left out, what names them must not stay.
     return [
-        f"{word} images: {_named(names)} ({len(names)} of {len(images)}) {reason}; leave them out"
-        f"{', and what names them' if len(names) > MOST_ABSENT * len(images) else ''}."
-        for word, names, reason in found
-        if names
+        f"{word} images: {', '.join(path.name for path in paths[:NAMED])}{' ...' * (len(paths) > NAMED)} "
+        f"({len(paths)} of {len(images)}) {reason}; leave them out, and what names them."
+        for word, paths, reason in found
+        if paths
     ]
-
-
-def _named(names: Sequence[str]) -> str:
-    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-    return ", ".join(names[:NAMED]) + more
