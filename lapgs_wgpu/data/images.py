@@ -9,10 +9,8 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,11 +32,9 @@ _ERRORS = (  # what Pillow raises; the last five for damage that it takes for va
     IndexError, KeyError, TypeError, struct.error, zlib.error,
 )  # fmt: skip
 _MODES = {"1", "L", "LA", "P", "PA", "RGB", "RGBA", "I;16", "I"}  # the last two: gray PNG of 16 bits
-_SIGNATURES = (  # bytes, their place, and the format
-    (b"WEBP", 8, "WebP"), (b"ftypheic", 4, "HEIC"), (b"ftypmif1", 4, "HEIC"), (b"ftypavif", 4, "AVIF"),
-    (b"II*\0", 0, "TIFF"), (b"MM\0*", 0, "TIFF"), (b"GIF8", 0, "GIF"), (b"BM", 0, "BMP"),
-    (b"\x76\x2f\x31\x01", 0, "OpenEXR"), (b"\xff\x0a", 0, "JPEG XL"),
-)  # fmt: skip
+_OTHER_FORMATS = {
+    b"WEBP": "WebP", b"ftyphei": "HEIC", b"ftypmif1": "HEIC", b"ftypavif": "AVIF", b"II*\0": "TIFF", b"MM\0*": "TIFF",
+}  # fmt: skip
 _ORIENTATION = 0x0112  # EXIF's tag
 SIDEWAYS = 5  # orientations from this one on exchange width and height
 
@@ -54,7 +50,8 @@ class ImageFile(NamedTuple):
     """An image file whose header was checked.
 
     size: (width, height) in pixels. orientation: as EXIF states it, 1 to 8; 1 is upright. deep: whether it has 16 bits
-    per channel, of which the upper 8 are read. upright: whether `read` turns it as `orientation` says. source: where it comes from if not from a file of the capture, for errors.
+    per channel, of which the upper 8 are read. upright: whether `read` turns it as `orientation` says. source: where it
+    comes from if not from a file of the capture, for errors.
     """
 
     path: Path
@@ -121,13 +118,10 @@ def _content(path: Path) -> str:
     """What a file that is neither PNG nor JPEG holds, and what to do, for errors."""
     with path.open("rb") as file:
         head = file.read(64)
-    if not head:
-        return "is empty (0 bytes); copy or render it again."
     if head.startswith(LFS_POINTER):
         return "is a pointer of Git LFS in place of the image; fetch it by git lfs pull."
-    for start, at, name in _SIGNATURES:
-        if head[at:].startswith(start):
-            return f"holds an image in the format {name}, whatever its name; convert it to PNG or JPEG."
+    if name := next((name for mark, name in _OTHER_FORMATS.items() if mark in head[:12]), None):
+        return f"holds an image in the format {name}, whatever its name; convert it to PNG or JPEG."
     return "is not a readable image (neither PNG nor JPEG); copy or render it again."
 
 
@@ -185,16 +179,6 @@ def repeats(gray: NDArray[np.float32], before: NDArray[np.float32]) -> bool:
     return gray.shape == before.shape and bool(np.abs(gray - before).max() <= EQUAL)
 
 
-def blurred_and_repeated(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
-    """The images of one camera, in the order of time, that are blurred, and those that repeat the one before. Raises
-    InputError."""
-    with ThreadPoolExecutor(4, thread_name_prefix="thumbnails") as pool:
-        gray = list(pool.map(gray_thumbnail, paths))
-    soft = blurred(np.array([sharpness(each) for each in gray]))
-    repeated = [path for path, (before, now) in zip(paths[1:], pairwise(gray), strict=True) if repeats(now, before)]
-    return [path for path, bad in zip(paths, soft, strict=True) if bad], repeated
-
-
 @contextmanager
 def _decoding(path: Path) -> Iterator[None]:
     try:
@@ -205,17 +189,12 @@ def _decoding(path: Path) -> Iterator[None]:
 
 def encode_png(image: Pixels, *, level: int = 6) -> bytes:
     """Encode an image (H, W) gray, (H, W, 3) RGB or (H, W, 4) RGBA as PNG. level: of the compression, 0 to 9."""
-    return _encoded(image, ".png", compress_level=level)
+    return iio.imwrite("<bytes>", image, extension=".png", plugin="pillow", is_batch=False, compress_level=level) or b""
 
 
 def encode_jpeg(image: Pixels) -> bytes:
     """Encode an image (H, W, 3) RGB as JPEG of quality 80, for a page."""
-    return _encoded(image, ".jpg", quality=80)
-
-
-def _encoded(image: Pixels, extension: str, **options: Any) -> bytes:
-    options["is_batch"] = False
-    return iio.imwrite("<bytes>", image, extension=extension, plugin="pillow", **options) or b""
+    return iio.imwrite("<bytes>", image, extension=".jpg", plugin="pillow", is_batch=False, quality=80) or b""
 
 
 def resize(image: Pixels, size: Size, resampling: Image.Resampling) -> Pixels:

@@ -46,7 +46,7 @@ class Fields:
 
     def vector(self, name: str, length: int) -> NDArray[np.float64]:
         """Return (length,) numbers of at most LARGEST_ENTRY. Raises InputError."""
-        return vector(self.required(name), length, name, self.where)
+        return matrix(self.required(name), (length,), name, self.where)
 
     def entries(self, name: str, count: int | None = None) -> list[Any]:
         """Return a list of at least one entry, or of `count`. Raises InputError."""
@@ -93,20 +93,15 @@ def number(
     return converted
 
 
-def vector(value: Any, length: int, name: str, where: str | Path) -> NDArray[np.float64]:
-    """Convert a JSON list to (length,) numbers of at most LARGEST_ENTRY. Raises InputError."""
-    if not isinstance(value, list) or len(value) != length:
-        raise InputError(f"{where}: {name} must be a list of {length} numbers, got {kind(value)}.")
+def matrix(value: Any, shape: tuple[int, ...], name: str, where: str | Path) -> NDArray[np.float64]:
+    """Convert a JSON list, or lists in lists, to numbers of this shape, of at most LARGEST_ENTRY. Raises InputError."""
+    if not isinstance(value, list) or len(value) != shape[0]:
+        needed = " rows of ".join(map(str, shape))
+        raise InputError(f"{where}: {name} must be {needed} numbers, got {kind(value)}.")
+    if len(shape) > 1:
+        return np.stack([matrix(row, shape[1:], name, where) for row in value])
     bounds = -LARGEST_ENTRY, LARGEST_ENTRY
     return np.array([number(entry, f"each entry of {name}", where, *bounds) for entry in value])
-
-
-def matrix(value: Any, shape: tuple[int, int], name: str, where: str | Path) -> NDArray[np.float64]:
-    """Convert a JSON list of rows to numbers (rows, columns) of at most LARGEST_ENTRY. Raises InputError."""
-    rows, columns = shape
-    if not isinstance(value, list) or len(value) != rows:
-        raise InputError(f"{where}: {name} must be {rows} rows of {columns} numbers, got {kind(value)}.")
-    return np.stack([vector(row, columns, name, where) for row in value])
 
 
 def kind(value: Any) -> str:

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +18,18 @@ from lapgs_wgpu.data.cloud import Cloud, in_view, views_of
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.focus import FAR_APART, degrees_apart, spread
 from lapgs_wgpu.data.frames import Frame
-from lapgs_wgpu.data.images import BLURRED, EQUAL, ImageFile, blurred_and_repeated, decode, scales_to, size_text
+from lapgs_wgpu.data.images import (
+    BLURRED,
+    EQUAL,
+    ImageFile,
+    blurred,
+    decode,
+    gray_thumbnail,
+    repeats,
+    scales_to,
+    sharpness,
+    size_text,
+)
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.placement import near_focus
 from lapgs_wgpu.data.poses import AXES_HINT
@@ -238,9 +251,16 @@ def check_film(images: Sequence[Path]) -> list[str]:
     """Warn about images of one camera, in the order of time, that are blurred or repeated."""
     if len(images) < 3:
         return []
-    blurry, repeated = blurred_and_repeated(images)
+    with ThreadPoolExecutor(4, thread_name_prefix="thumbnails") as pool:
+        gray = list(pool.map(gray_thumbnail, images))
+    soft = blurred(np.array([sharpness(each) for each in gray]))
+    repeated = [path for path, (before, now) in zip(images[1:], pairwise(gray), strict=True) if repeats(now, before)]
     found = (
-        ("blurred", blurry, f"have less than {BLURRED:g} of their neighbours' sharpness"),
+        (
+            "blurred",
+            [path for path, bad in zip(images, soft, strict=True) if bad],
+            f"have less than {BLURRED:g} of their neighbours' sharpness",
+        ),
         ("repeated", repeated, f"differ by at most {EQUAL} of 255 levels from the one before: motion stands still"),
     )
     return [

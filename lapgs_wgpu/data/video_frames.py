@@ -60,11 +60,9 @@ def frames_folder(path: Path, size: Size, shape: Display) -> Path:
 def _check_header(path: Path) -> tuple[Display, Size]:
     """Check the header and decode the first frame: how it is shown, and the (width, height) as shown.
 
-    Raises InputError for what is no film, and for frames that are too large, too many, or not of square pixels.
+    Raises InputError for what is no film, and for frames that are too large, or not of square pixels.
     """
     with opened_film(path) as (file, stream):
-        if stream.frames > (size := path.stat().st_size):
-            raise InputError(f"{path} has {stream.frames} frames, it states, in {size} bytes; copy it again.")
         if abs(pixel_aspect(stream) - 1) > 0.01:
             raise InputError(
                 f"{path} has frames of {stream.width}x{stream.height} pixels, each {pixel_aspect(stream):.3g} times as "
@@ -114,12 +112,13 @@ def opened_film(path: Path) -> Iterator[tuple[Any, Any]]:
     av = import_av(path)
     try:
         with av.open(str(path), metadata_errors="replace") as file:
-            streams = [each for each in file.streams.video if not int(each.disposition) & _ATTACHED_PICTURE]
-            if not streams:
-                raise InputError(f"{path} has no video stream; give the camera's recording.")
-            decoded = [each for each in streams if each.codec_context is not None]
+            films = [each for each in file.streams.video if not int(each.disposition) & _ATTACHED_PICTURE]
+            decoded = [each for each in films if each.codec_context is not None]
             if not decoded:
-                raise InputError(f"{path} is in a format that PyAV cannot decode; convert it to H.264.")
+                raise InputError(
+                    f"{path} has {len(films)} video streams, and PyAV can decode none; give the camera's recording, or "
+                    "convert it to H.264."
+                )
             stream = max(decoded, key=lambda each: (each.width or 0) * (each.height or 0))
             if not 1 <= stream.width * stream.height <= LARGEST_FRAME:
                 raise InputError(

@@ -30,13 +30,13 @@ STRIDE = 4  # without val_ids: every fourth id from the first on is for training
 
 def _read(folder: Path, image_size: int | None) -> Capture:
     """Images come from the folder rgb/Nx with the smallest that are at least of the wanted size, else the largest."""
-    ids, train_ids, test_ids = _splits(_object(folder / "dataset.json"))
-    scene = _object(folder / "scene.json")
+    ids, train_ids, test_ids = _splits(read_json(folder / "dataset.json"))
+    scene = read_json(folder / "scene.json")
     moved = Normalization(scene.vector("center", 3), scene.number("scale", TINY))
     depths = scene.number("near", TINY), scene.number("far", TINY)
     if depths[0] >= depths[1]:
         raise InputError(f"{scene.where}: near must be below far, got {depths[0]:g} and {depths[1]:g}.")
-    times = _times(_object(folder / "metadata.json"), ids)
+    times = _times(read_json(folder / "metadata.json"), ids)
     rgb = _image_folder(folder / "rgb", train_ids + test_ids, image_size)
     files = CaptureFiles(rgb)
     splits: dict[Split, list[str]] = {"train": train_ids, "test": test_ids}
@@ -47,7 +47,7 @@ def _read(folder: Path, image_size: int | None) -> Capture:
             if image is None:
                 continue
             where = folder / "camera" / f"{name}.json"
-            lens, pose = _read_camera(_object(where))
+            lens, pose = _read_camera(read_json(where))
             frames.append(
                 Frame(
                     check_image(rgb / image),
@@ -133,12 +133,6 @@ def _image_folder(rgb: Path, names: Sequence[str], image_size: int | None) -> Pa
     if best is None:
         raise InputError(f"{rgb} holds no folder 1x, 2x, ... with {names[0]}.png, which dataset.json names.")
     return best
-
-
-def _object(path: Path) -> Fields:
-    if not path.is_file():
-        raise InputError(f"{path} does not exist; a capture in nerfies' layout needs it.")
-    return read_json(path)
 
 
 def _names(data: Fields, field: str) -> list[str]:

@@ -42,7 +42,7 @@ def _read_split(folder: Path, data: Fields, split: Split, warnings: list[str]) -
     times = len(data.entries("fn"))
     columns = {name: data.entries(name, times) for name in ("fn", "k", "w2c", "cam_id")}
     images = CaptureFiles(folder / IMAGES)
-    frames, lenses, poses, count = [], dict[str, Lens](), dict[str, Array](), 0
+    frames, count = [], 0
     for time in range(times):
         here = Fields({name: column[time] for name, column in columns.items()}, f"{data.where}, time {time}")
         names = here.entries("fn")
@@ -53,14 +53,10 @@ def _read_split(folder: Path, data: Fields, split: Split, warnings: list[str]) -
             if (named := images.image(Fields({"fn": file}, here.where), "fn")) is None:
                 continue
             found, image = named
-            # The same for all times of a camera, as a rule: each is checked once.
-            lens, pose = str(k), str(w2c)
-            lenses[lens] = lenses.get(lens) or _lens(k, width, height, where)
-            if pose not in poses:
-                poses[pose] = _pose(w2c, where)
+            lens, pose = _lens(k, width, height, where), _pose(w2c, where)
             name = ImageName(found, str(PurePosixPath(found).parent))
             label = f"cam{kind(camera)}_{time:05d}"
-            frames.append(Frame(image, lenses[lens], poses[pose], where, name, time=time, split=split, label=label))
+            frames.append(Frame(image, lens, pose, where, name, time=time, split=split, label=label))
     warnings += images.left_out(count, folder / FILES[split])
     return frames
 

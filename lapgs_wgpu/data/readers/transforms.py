@@ -1,13 +1,8 @@
 """Readers of transforms files: nerfstudio's transforms.json, and D-NeRF's transforms_{train,test,val}.json.
 
 Both list frames: path, pose (`transform_matrix`, camera to world, OpenGL's axes) and perhaps time of each image, with
-intrinsics of each or of all. docs/data.md lists the fields.
-
-nerfstudio: the cloud of ply_file_path is in the coordinates of transform_matrix, since applied_transform was applied to
-both. Apps that write ARKit's or ARCore's poses in this form state `timestamp` instead of `time`.
-
-D-NeRF: times lie in [0, 1]; frames without are evenly spaced. transforms_val.json is optional, and left out with a
-warning if it is not usable. A cloud (CLOUDS) is optional.
+intrinsics of each or of all. docs/data.md lists the fields. nerfstudio's cloud is in the coordinates of
+transform_matrix, since applied_transform was applied to both.
 """
 
 from __future__ import annotations
@@ -213,11 +208,6 @@ def _read_dnerf(folder: Path, image_size: int | None) -> Capture:
 def _read_split(folder: Path, split: Split, warnings: list[str]) -> list[Frame]:
     """Read the frames of one transforms file. Appends a warning about images that do not exist."""
     path, files = folder / f"transforms_{split}.json", CaptureFiles(folder)
-    if not path.is_file():
-        raise InputError(
-            f"{path} does not exist, which a D-NeRF scene needs; if there is one file alone, name it transforms.json, "
-            "and every eighth image is held out."
-        )
     read = _read_frames(read_json(path), files, "time")
     frames = []
     for index, frame in enumerate(read):
