@@ -182,11 +182,10 @@ def test_colors_of_clouds(tmp_path: Path, name: str) -> None:
     np.testing.assert_allclose(colors, true, atol=1e-6)
 
 
-def test_a_cloud_whose_colors_are_not_known(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_cloud_whose_colors_are_not_known(tmp_path: Path) -> None:
     columns = dict.fromkeys([*"xyz", "intensity"], ("float", [0.0, 1.0]))
     (tmp_path / "a.ply").write_bytes(ply_bytes(columns))
     assert read_points(tmp_path / "a.ply")[1] is None
-    assert "intensity" in capsys.readouterr().err
 
 
 def test_half_precision(tmp_path: Path) -> None:

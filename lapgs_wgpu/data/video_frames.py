@@ -42,19 +42,23 @@ def unpacked(path: Path, image_size: int | None) -> list[ImageFile]:
     """
     shape, size = _check_header(path)
     wanted = shrunk_size(size, image_size)
-    folder = frames_folder(path, wanted, shape)
+    folder = frames_folder(path, wanted)
     if not folder.is_dir():
         _unpack(path, folder, shape, size, wanted)
     files = sorted(folder.glob("*.png"))
     return [ImageFile(file, wanted, source=f"{path}, frame {number}") for number, file in enumerate(files)]
 
 
-def frames_folder(path: Path, size: Size, shape: Display) -> Path:
+def frames_folder(path: Path, size: Size) -> Path:
     """The folder for the frames of this (width, height); size and date of the film are part of its name."""
     stat, path = path.stat(), path.resolve()
-    state = f"{stat.st_size:x}-{stat.st_mtime_ns:x}" + (f"-{shape}" if any(shape) else "")
     caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lapgs_wgpu"
-    return caches / "frames" / _place(path.parent) / f"{path.stem}-{size[0]}x{size[1]}-{state}"
+    return (
+        caches
+        / "frames"
+        / _place(path.parent)
+        / f"{path.stem}-{size[0]}x{size[1]}-{stat.st_size:x}-{stat.st_mtime_ns:x}"
+    )
 
 
 def _check_header(path: Path) -> tuple[Display, Size]:
@@ -140,9 +144,6 @@ class Display(NamedTuple):
 
     turns: int
     mirrored: bool
-
-    def __str__(self) -> str:
-        return f"turned-{self.turns}" + ("-mirrored" if self.mirrored else "")
 
     def size(self, coded: Size) -> Size:
         """(width, height) as shown."""

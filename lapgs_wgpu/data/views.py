@@ -19,7 +19,6 @@ from lapgs_wgpu.data.images import Size, shrink
 from lapgs_wgpu.data.masks import MOSTLY, as_pixels
 from lapgs_wgpu.data.normalize import BOX, Normalization
 from lapgs_wgpu.data.timestamps import time_step
-from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
 AROUND = 6  # cameras that tell what moves between them
@@ -52,12 +51,6 @@ class View:
     def load(self) -> NDArray[np.uint8]:
         """Decode the image: (H, W, 3) RGB or (H, W, 4) straight RGBA, uint8, read-only. Raises InputError."""
         image = self.pixels()
-        size = (self.camera.height, self.camera.width)
-        if image.dtype != np.uint8 or image.shape not in {(*size, 3), (*size, 4)}:
-            raise InputError(
-                f"{self.source}: expected {size[1]}x{size[0]} pixels of 3 or 4 channels in 8 bit, "
-                f"got an array of {image.shape} {image.dtype}; was the file replaced while it was in use?"
-            )
         image.setflags(write=False)
         return image
 
