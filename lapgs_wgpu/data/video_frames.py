@@ -53,12 +53,8 @@ def frames_folder(path: Path, size: Size) -> Path:
     """The folder for the frames of this (width, height); size and date of the film are part of its name."""
     stat, path = path.stat(), path.resolve()
     caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lapgs_wgpu"
-    return (
-        caches
-        / "frames"
-        / _place(path.parent)
-        / f"{path.stem}-{size[0]}x{size[1]}-{stat.st_size:x}-{stat.st_mtime_ns:x}"
-    )
+    name = f"{path.stem}-{size[0]}x{size[1]}-{stat.st_size:x}-{stat.st_mtime_ns:x}"
+    return caches / "frames" / _place(path.parent) / name
 
 
 def _check_header(path: Path) -> tuple[Display, Size]:
