@@ -36,7 +36,7 @@ class Source:
 
 
 def view_of(source: Source, name: str = "train_000", time: float = 0.0) -> View:
-    return View(name=name, camera=CAMERA, time=time, source=f"{name}.png", pixels=source)
+    return View(name=name, camera=CAMERA, time=time, source=f"{name}.png", load=source)
 
 
 def rig(times: int, cameras: int) -> list[View]:

@@ -243,7 +243,7 @@ def _view(frame: Frame, number: int, camera: Camera, undistortion: Undistortion)
         camera=camera,
         time=frame.time,
         source=str(frame.image),
-        pixels=pixels,
+        load=pixels,
         ignored=mask(frame.mask, frame.mask_kind) if frame.split == "train" else None,
         moving=mask(frame.moving, "white", MOSTLY),
     )

@@ -141,7 +141,7 @@ def clock_times(names: Sequence[ImageName]) -> tuple[list[float], str] | None:
     """Return the times in seconds that all names state, and what they are; None if these are neither clock times nor
     decimals, or if two images of a camera have the same."""
     matches = [match for name in names if (match := _CLOCK.search(name.stamp))]
-    clocks = [seconds for match in matches if (seconds := _seconds(match)) is not None]
+    clocks = [clock for match in matches if (clock := _seconds(match)) is not None]
     dated = {match["date"] is not None for match in matches} if len(clocks) == len(names) else set()
     readings = (
         (clocks if dated == {True} else None, "clock times"),

@@ -214,7 +214,7 @@ def _depth_cloud(folder: Path, frames: list[Frame]) -> Cloud:
         row, column = row[kept], column[kept]
         height, width = depth.shape
         camera = Camera(frame.lens.resized(width, height).K, frame.T_cam_world, width, height)
-        points.append(points_at(camera, np.stack([column, row], axis=1) + 0.5, depth[row, column]))
+        points.append(points_at(camera, np.column_stack([column + 0.5, row + 0.5]), depth[row, column]))
         colors.append(image[row, column] / 255)
     if not sum(map(len, points)):
         raise InputError(f"{folder / DEPTH}: all depths are 0, which means unknown; remove the folder.")
