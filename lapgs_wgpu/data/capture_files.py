@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import unicodedata
 from functools import cached_property
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -16,7 +15,6 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.listing import is_desktop_file
 
 MOST_ABSENT = 0.2  # share of the images of a capture that may be absent: whoever deletes blurred ones deletes fewer
-_SMALLER = re.compile(r"(?<![^/])images_\d+/")  # folders of smaller images, as other programs write them beside images/
 
 
 def files_below(folder: Path) -> list[str]:
@@ -44,8 +42,8 @@ class CaptureFiles:
     def find(self, name: str) -> str | None:
         """Return the path of an existing file relative to the folder, with slashes; None if there is none.
 
-        The name may differ from the file's in slashes, number of blanks (also %20), Unicode form, letter case, .jpeg
-        for .jpg, and images_4 for images. Of one that leads out of the folder, as it was written elsewhere, or begins
+        The name may differ from the file's in slashes, number of blanks (also %20), Unicode form, letter case, and
+        .jpeg for .jpg. Of one that leads out of the folder, as it was written elsewhere, or begins
         with the folder's own name, the end that is a file in the folder counts. The file whose name is the same goes
         before others.
         """
@@ -57,15 +55,14 @@ class CaptureFiles:
         if _leads_out(name):
             starts += range(1, len(parts))
         for key in ("/".join(parts[start:]) for start in starts):
-            if found := self._by_name.get(key) or self._by_name.get(_SMALLER.sub("images/", key)):
+            if found := self._by_name.get(key):
                 return found
         return self.find(unquote(name)) if unquote(name) != name else None
 
     @cached_property
     def _by_name(self) -> dict[str, str]:
-        """The files by their folded names; those in a folder of smaller images also as in images."""
-        files = {_folded(path): path for path in reversed(files_below(self.folder))}
-        return {_SMALLER.sub("images/", name): path for name, path in files.items()} | files
+        """The files by their folded names."""
+        return {_folded(path): path for path in reversed(files_below(self.folder))}
 
     def find_image(self, name: str, named: str) -> str | None:
         """As `find`, of an image, whose name may lack the suffix. If there is none, a sentence goes to `absent`.

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.io.ply_elements import LFS_POINTER
 
 Pixels = NDArray[np.uint8]
 Size = tuple[int, int]  # (width, height) in pixels
@@ -32,9 +31,6 @@ _ERRORS = (  # what Pillow raises; the last five for damage that it takes for va
     IndexError, KeyError, TypeError, struct.error, zlib.error,
 )  # fmt: skip
 _MODES = {"1", "L", "LA", "P", "PA", "RGB", "RGBA", "I;16", "I"}  # the last two: gray PNG of 16 bits
-_OTHER_FORMATS = {
-    b"WEBP": "WebP", b"ftyphei": "HEIC", b"ftypmif1": "HEIC", b"ftypavif": "AVIF", b"II*\0": "TIFF", b"MM\0*": "TIFF",
-}  # fmt: skip
 _ORIENTATION = 0x0112  # EXIF's tag
 SIDEWAYS = 5  # orientations from this one on exchange width and height
 
@@ -105,24 +101,13 @@ def check_image(path: Path, *, whole: bool = True) -> ImageFile:
             deep = file.format == "PNG" and "16" in str(file.tile[0][3])
             if whole:
                 file.verify()
-    except Image.UnidentifiedImageError:
-        raise InputError(f"{path} {_content(path)}") from None
     except _ERRORS as reason:
-        raise InputError(f"{path} is not a readable image ({reason}); copy or render it again.") from None
+        raise InputError(
+            f"{path} is not a readable PNG or JPEG ({reason}); convert it, or copy or render it again."
+        ) from None
     if mode not in _MODES:
         raise InputError(f"{path} has pixels of mode {mode}; save it as RGB or RGBA with 8 bits per channel.")
     return ImageFile(path, size, orientation if orientation in range(1, 9) else 1, deep)
-
-
-def _content(path: Path) -> str:
-    """What a file that is neither PNG nor JPEG holds, and what to do, for errors."""
-    with path.open("rb") as file:
-        head = file.read(64)
-    if head.startswith(LFS_POINTER):
-        return "is a pointer of Git LFS in place of the image; fetch it by git lfs pull."
-    if name := next((name for mark, name in _OTHER_FORMATS.items() if mark in head[:12]), None):
-        return f"holds an image in the format {name}, whatever its name; convert it to PNG or JPEG."
-    return "is not a readable image (neither PNG nor JPEG); copy or render it again."
 
 
 def decode(path: Path) -> Pixels:

@@ -59,7 +59,7 @@ def place(capture: Capture, cameras: Sequence[Camera], moving: Cube | None) -> P
         cloud = _filled(cloud, cameras)
     if cube is None or (capture.keeps_coordinates and cube.fits):
         return Placement(None, cloud and cloud.rounded, depths, warnings)
-    fit = cube.normalization
+    fit = Normalization(cube.center, BOX / cube.half)
     return Placement(
         fit,
         None if cloud is None else fit.cloud(cloud),

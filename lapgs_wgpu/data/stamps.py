@@ -17,13 +17,12 @@ TIME_WORDS = {"frame", "fr", "time", "timestep", "timestamp", "ts", "t", "step",
 CAMERA_WORDS = {"cam", "camera", "c", "view", "kinect", "device"}
 FILLED = 1.25  # of the images: cameras times their moments, where a fifth of these may lack an image
 STILL = 0.02  # of the distance of cameras: the places of one that stands still are apart by less
-_CLOCK = re.compile(  # 20260110_095848, 2026-01-10 at 9.58.48 PM, 09-58-48; digits after that are parts of a second
+_CLOCK = re.compile(  # 20260110_095848, 2026-01-10 9.58.48, 09-58-48; digits after that are parts of a second
     r"(?<!\d)(?:(?P<date>(?:19|20)\d\d([-_.]?)\d\d\2\d\d)\D{0,4})?"
     r"(?P<hour>\d\d|(?<!\d)\d(?=[-_.:]))(?P<by>[-_.:]?)(?P<minute>\d\d)(?P=by)(?P<second>\d\d)"
-    r"(?:[-_.]?(?P<part>\d{3}|\d{6}))?(?!\d)(?:\s?(?P<half>[AaPp])[Mm]\b)?"
+    r"(?:[-_.]?(?P<part>\d{3}|\d{6}))?(?!\d)"
 )
 _DECIMAL = re.compile(r"(?:(?<![\w.])|(?<=[_-]))(\d+(?:\.(\d+))?)s?(?![\w.])")  # 0.25, t_0.25, 0.25s
-_DAY = 86400.0  # seconds
 
 
 class ImageName(NamedTuple):
@@ -157,8 +156,6 @@ def clock_times(names: Sequence[ImageName]) -> tuple[list[float], str] | None:
 def _seconds(found: re.Match[str]) -> float | None:
     """Seconds of a match of _CLOCK, from its midnight where it has no date; None where it is no possible time."""
     hour, minute, second = (int(found[part]) for part in ("hour", "minute", "second"))
-    if found["half"]:
-        hour = hour % 12 + 12 * (found["half"] in "Pp")
     try:
         midnight = datetime.strptime(re.sub(r"\D", "", found["date"] or "19700101"), "%Y%m%d").replace(tzinfo=UTC)
     except ValueError:  # 20261399_000001
@@ -171,21 +168,16 @@ def _seconds(found: re.Match[str]) -> float | None:
 def _times_of_day(
     names: Sequence[ImageName], matches: Sequence[re.Match[str]], clocks: Sequence[float]
 ) -> list[float] | None:
-    """Seconds of HHMMSS without a date, also past midnight; None unless they are alike in all else that the names of a
-    camera hold, and more even as times than as numbers, which jump by 40 each minute."""
+    """Seconds of HHMMSS without a date; None unless they are alike in all else that the names of a camera hold, and
+    more even as times than as numbers, which jump by 40 each minute."""
     around = {(name.camera, _CLOCK.sub("", name.stamp, count=1)) for name in names}
     if len(around) > len({name.camera for name in names}):
         return None
-    times = np.array(clocks)
-    ordered = np.sort(times)
-    pause = int(np.argmax(np.diff(ordered, append=ordered[-1])))
-    if pause + 1 < len(ordered) and ordered[pause + 1] - ordered[pause] > _DAY / 2:
-        times = np.where(times <= ordered[pause], times + _DAY, times)
-    numbers = np.array([float(re.sub(r"\D", "", match[0])) for match in matches])
-    return times.tolist() if _unevenness(times) < _unevenness(numbers) else None
+    numbers = [float(re.sub(r"\D", "", match[0])) for match in matches]
+    return list(clocks) if _unevenness(clocks) < _unevenness(numbers) else None
 
 
-def _unevenness(values: NDArray[np.float64]) -> float:
+def _unevenness(values: Sequence[float]) -> float:
     """The largest step between ascending values, in usual ones."""
     steps = np.diff(np.unique(values))
     return float(steps.max() / np.median(steps)) if len(steps) else 0.0

@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from contextlib import suppress
 from itertools import pairwise
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,12 +32,9 @@ def read_times(names: Sequence[ImageName], folder: Path) -> tuple[list[float], s
     path = folder / TIMES
     if path.is_file():
         return _listed(names, path), str(path)
-    folders = names[0].part in PurePosixPath(names[0].file).parts  # state the times
-    whose = f"the names of folders in {folder}" if folders else f"the names of {folder}"
-    if clocks := clock_times(names):
-        times, kind = clocks
-        return times, f"the {kind} in {whose}"
-    return [float(number) for number in frame_numbers(names)], f"the frame numbers in {whose}"
+    clocks = clock_times(names)
+    times, kind = clocks or ([float(number) for number in frame_numbers(names)], "frame numbers")
+    return times, f"the {kind} in the names of {folder}"
 
 
 def time_step(times: NDArray[np.float64]) -> float:

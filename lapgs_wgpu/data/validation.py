@@ -85,35 +85,31 @@ def check_depth(images: Sequence[ImageFile]) -> list[str]:
 
 
 def check_frames(frames: Sequence[Frame]) -> None:
-    """Check that all images have one size, which fits their cameras. Raises InputError."""
-    checked: set[Lens] = set()
-    first = frames[0].image
+    """Check that all images have one size, and that each lens has plausible focal lengths and the image's proportions.
+
+    Raises InputError.
+    """
+    first, by_lens = frames[0].image, dict[Lens, Frame]()
     for frame in frames:
+        by_lens.setdefault(frame.lens, frame)
         if frame.image.size != first.size:
             raise InputError(
                 f"{frame.image} is {size_text(frame.image.size)} pixels and {first} is {size_text(first.size)}; all "
                 "images must have one size: crop or leave out those that differ."
             )
-        if frame.lens not in checked:
-            checked.add(frame.lens)
-            _check_lens(frame)
-
-
-def _check_lens(frame: Frame) -> None:
-    """Check that focal lengths are plausible, and that the image has the lens's proportions."""
-    lens, size, where = frame.lens, frame.image.size, frame.where
-    stated, longer = size_text(lens.size), max(lens.size)
-    for focal in (lens.fx, lens.fy):
-        if not MIN_FOCAL * longer <= focal <= MAX_FOCAL * longer:
+    for lens, frame in by_lens.items():
+        longer, stated = max(lens.size), size_text(lens.size)
+        for focal in (lens.fx, lens.fy):
+            if not MIN_FOCAL * longer <= focal <= MAX_FOCAL * longer:
+                raise InputError(
+                    f"{frame.where}: a focal length of {focal:.4g} pixels does not fit images of {stated}; it must be "
+                    f"{MIN_FOCAL:g} to {MAX_FOCAL:g} times the longer side, in pixels of that size."
+                )
+        if not scales_to(first.size, lens.size):
             raise InputError(
-                f"{where}: a focal length of {focal:.4g} pixels does not fit images of {stated}; it must be "
-                f"{MIN_FOCAL:g} to {MAX_FOCAL:g} times the longer side, in pixels of that size."
+                f"{frame.image} is {size_text(first.size)} pixels, but {frame.where} states {stated}, which has other "
+                "proportions; give the camera of this image, or turn it if it lies on its side."
             )
-    if not scales_to(size, lens.size):
-        raise InputError(
-            f"{frame.image} is {size_text(size)} pixels, but {where} states {stated}, which has other proportions; "
-            "give the camera of this image, or turn it if it lies on its side."
-        )
 
 
 def check_cloud(cloud: Cloud, cameras: Sequence[Camera], path: Path, warnings: list[str]) -> Cloud:

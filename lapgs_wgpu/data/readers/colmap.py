@@ -61,11 +61,8 @@ def _models(folder: Path) -> list[Path]:
 
 def _registered(model: ColmapModel, images: Path, files: list[str]) -> tuple[dict[str, ColmapImage], list[str]]:
     """Return the images of the model by the names of their files, and a warning about those that have no file."""
-    finder, existing = CaptureFiles(images), set(files)
-    registered = {image.name: image for image in model.images if image.name in existing}
-    for image in model.images:
-        if image.name in existing:
-            continue
+    finder, existing, registered = CaptureFiles(images), set(files), dict[str, ColmapImage]()
+    for image in sorted(model.images, key=lambda image: image.name not in existing):
         name = finder.find_image(image.name, f"{image.where} names it")
         if name is not None and registered.setdefault(name, image) is not image:  # another image's file
             finder.absent.append(f"{images / image.name} does not exist, but {image.where} names it")

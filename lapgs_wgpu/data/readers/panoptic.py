@@ -1,8 +1,6 @@
 """Reader of the layout of Dynamic 3D Gaussians: CMU Panoptic's calibrated cameras, which stand still and film together.
 
-train_meta.json and test_meta.json hold `w`, `h` and, for each time, lists over the cameras: `k` (3x3 intrinsics,
-pixels), `w2c` (world to camera, OpenCV's axes), `fn` (the image below ims/) and `cam_id`. Source: Luiten et al.,
-Dynamic 3D Gaussians (3DV 2024). init_pt_cld.npz, the depth cameras' cloud of the published figures, is not read.
+docs/data.md lists the fields. Source: Luiten et al., Dynamic 3D Gaussians (3DV 2024).
 """
 
 from __future__ import annotations
@@ -15,7 +13,7 @@ from lapgs_wgpu.data.capture_files import CaptureFiles
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, Fields, kind, matrix, read_json
 from lapgs_wgpu.data.lens import Lens
-from lapgs_wgpu.data.poses import Array, check_rotation, place_of, world_to_camera
+from lapgs_wgpu.data.poses import check_rotation, place_of, world_to_camera
 from lapgs_wgpu.data.stamps import ImageName
 from lapgs_wgpu.errors import InputError
 
@@ -53,7 +51,9 @@ def _read_split(folder: Path, data: Fields, split: Split, warnings: list[str]) -
             if (named := images.image(Fields({"fn": file}, here.where), "fn")) is None:
                 continue
             found, image = named
-            lens, pose = _lens(k, width, height, where), _pose(w2c, where)
+            T = matrix(w2c, (4, 4), "w2c", where)
+            check_rotation(T[:3, :3], f"{where}: w2c")
+            lens, pose = _lens(k, width, height, where), world_to_camera(T[:3, :3].T, place_of(T))
             name = ImageName(found, str(PurePosixPath(found).parent))
             label = f"cam{kind(camera)}_{time:05d}"
             frames.append(Frame(image, lens, pose, where, name, time=time, split=split, label=label))
@@ -68,13 +68,6 @@ def _lens(k: object, width: int, height: int, where: str) -> Lens:
     if np.abs(K[[1, 2, 2, 2], [0, 0, 1, 2]] - [0, 0, 0, 1]).max() > 0:
         raise InputError(f"{where}: k must be the rows fx s cx, 0 fy cy, 0 0 1.")
     return Lens(width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2], K[0, 1])
-
-
-def _pose(w2c: object, where: str) -> Array:
-    """(4, 4) of a field w2c. Raises InputError."""
-    T = matrix(w2c, (4, 4), "w2c", where)
-    check_rotation(T[:3, :3], f"{where}: w2c")
-    return world_to_camera(T[:3, :3].T, place_of(T))
 
 
 LAYOUT = "train_meta.json and test_meta.json beside ims/"
