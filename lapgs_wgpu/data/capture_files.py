@@ -9,9 +9,9 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from urllib.parse import unquote
 
 from lapgs_wgpu.data.images import SUFFIXES, ImageFile, check_image
-from lapgs_wgpu.data.json_fields import Fields, kind
+from lapgs_wgpu.data.json_fields import Fields
 from lapgs_wgpu.data.stamps import natural_key
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.errors import InputError, shown
 from lapgs_wgpu.io.listing import is_desktop_file
 
 MOST_ABSENT = 0.2  # share of the images of a capture that may be absent: whoever deletes blurred ones deletes fewer
@@ -110,10 +110,10 @@ class CaptureFiles:
         """A path whose file, if there is one, lies below the folder; symbolic links may lead out. Raises InputError."""
         name = entry.required(field)
         if not isinstance(name, str) or not name:
-            raise InputError(f"{entry.where}: {field} must be the path of a file, got {kind(name)}.")
+            raise InputError(f"{entry.where}: {field} must be the path of a file, got {shown(name)}.")
         if _leads_out(name) and self.find(name) is None:
             raise InputError(
-                f"{entry.where}: {field} {kind(name)} leads out of the scene's folder, which holds no file of this "
+                f"{entry.where}: {field} {shown(name)} leads out of the scene's folder, which holds no file of this "
                 "name; put the file, or a link to it, into the folder, and name that."
             )
         return name

@@ -1,8 +1,5 @@
-"""Films of still cameras. Each is unpacked once into lossless images outside the capture, and read from there.
-
-Frames depend on each other: decoding one in the middle of a clip takes seconds, since all frames from the last keyframe
-on are decoded first (docs/notes/captures.md has the times), and a training reads frames in random order, again and
-again.
+"""Films of still cameras. Each is unpacked once into lossless images outside the capture, and read from there, since
+decoding a frame in the middle of a clip takes seconds (docs/notes/captures.md).
 """
 
 from __future__ import annotations
@@ -81,9 +78,8 @@ def _unpack(path: Path, folder: Path, shape: Display, size: Size, wanted: Size) 
     """Write every frame, of (width, height) `size`, as PNG of the wanted size into a new folder. Raises InputError."""
     print(f"{path}: its frames are unpacked once, into {folder}", file=sys.stderr, flush=True)
     written, declared = list[Future[None]](), 0
-    room = f"{wanted[0] * wanted[1] * 1.5e-6:.1f} MB a frame"
     with (
-        new_folder(folder, f"make room there, {room}, or set XDG_CACHE_HOME to another folder") as unfinished,
+        new_folder(folder, "make room there, or set XDG_CACHE_HOME to another folder") as unfinished,
         ThreadPoolExecutor(WRITERS, thread_name_prefix="unpack") as pool,
         opened_film(path) as (file, stream),
     ):

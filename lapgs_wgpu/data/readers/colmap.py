@@ -1,10 +1,7 @@
 """Reader of COLMAP's sparse models: sparse/ or sparse/N (`colmap_model`) beside the images in images/.
 
 Each folder below images/ is a camera, or a time (`stamps`). If the model places each of several cameras at one point,
-they do not move, and images of a camera that have no pose have that of its first one. docs/own-data.md says how to make
-such a capture.
-
-Models without points, and with a camera for each image, as other programs export them, are read, too.
+they do not move, and images of a camera that have no pose have that of its first one.
 """
 
 from __future__ import annotations

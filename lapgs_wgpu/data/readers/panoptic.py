@@ -11,11 +11,11 @@ import numpy as np
 
 from lapgs_wgpu.data.capture_files import CaptureFiles
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
-from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, Fields, kind, matrix, read_json
+from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, Fields, matrix, read_json
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.poses import check_rotation, place_of, world_to_camera
 from lapgs_wgpu.data.stamps import ImageName
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.errors import InputError, shown
 
 IMAGES = "ims"
 FILES: dict[Split, str] = {"train": "train_meta.json", "test": "test_meta.json"}
@@ -47,7 +47,7 @@ def _read_split(folder: Path, data: Fields, split: Split, warnings: list[str]) -
         others = [here.entries(name, len(names)) for name in ("k", "w2c", "cam_id")]
         for file, k, w2c, camera in zip(names, *others, strict=True):
             count += 1
-            where = f"{here.where}, image {kind(file)}"
+            where = f"{here.where}, image {shown(file)}"
             if (named := images.image(Fields({"fn": file}, here.where), "fn")) is None:
                 continue
             found, image = named
@@ -55,7 +55,7 @@ def _read_split(folder: Path, data: Fields, split: Split, warnings: list[str]) -
             check_rotation(T[:3, :3], f"{where}: w2c")
             lens, pose = _lens(k, width, height, where), world_to_camera(T[:3, :3].T, place_of(T))
             name = ImageName(found, str(PurePosixPath(found).parent))
-            label = f"cam{kind(camera)}_{time:05d}"
+            label = f"cam{shown(camera)}_{time:05d}"
             frames.append(Frame(image, lens, pose, where, name, time=time, split=split, label=label))
     warnings += images.left_out(count, folder / FILES[split])
     return frames
