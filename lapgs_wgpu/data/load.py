@@ -65,8 +65,9 @@ def load_dataset(
     frames = list(capture.frames)
     if not undistort:
         frames = [dataclasses.replace(frame, lens=frame.lens.idealized) for frame in frames]
-    frames, warnings = upright(frames)
-    warnings = [*capture.warnings, *warnings, *check_depth([frame.image for frame in frames])]
+    warnings = list(capture.warnings)
+    frames = upright(frames, warnings)
+    warnings += check_depth([frame.image for frame in frames])
     frames, time_source = _timed(folder, dataclasses.replace(capture, frames=frames), warnings)
     check_frames(frames)
     own_masks, own_movers = None if masks is None else Path(masks), None if movers is None else folder / movers
@@ -79,22 +80,19 @@ def load_dataset(
     if capture.cloud is not None:
         if capture.own_footage:
             warnings += check_views(capture.cloud, list(dict.fromkeys(cameras)), capture.source)
-        cloud = check_cloud(capture.cloud, training_cameras, capture.source, warnings)
-        capture = dataclasses.replace(capture, cloud=cloud)
+        seen_cloud = check_cloud(capture.cloud, training_cameras, capture.source, warnings)
+        capture = dataclasses.replace(capture, cloud=seen_cloud)
     moving = None
     if movers is not None and capture.cloud is not None:
         by_time = sorted(training, key=lambda pair: pair[1].time or 0.0)
         seen = [(c, _view(frame, 0, c, undistortions[frame.lens]).moving) for c, frame in by_time]
         moving = mover_cube(capture.cloud, [(camera, mask) for camera, mask in seen if mask is not None])
-    placement = place(capture, training_cameras, moving)
-    warnings += placement.warnings
-
-    fit = placement.normalization
+    fit, cloud, depths = place(capture, training_cameras, moving, warnings)
     whole = fit if fit is None or capture.moved is None else capture.moved.then(fit)
     placed = {camera: camera if fit is None else fit.camera(camera) for camera in set(cameras)}
     # Without a cloud, what stands just before one camera would explain its images alone, and block those beside it.
-    if placement.depths is not None and placement.cloud is None:
-        near = NEAR_SHARE * placement.depths[0]
+    if depths is not None and cloud is None:
+        near = NEAR_SHARE * depths[0]
         placed = {camera: dataclasses.replace(seen, near=near) for camera, seen in placed.items()}
     order = _by_film(frames, warnings) if capture.own_footage else range(len(frames))
 
@@ -110,8 +108,8 @@ def load_dataset(
         views("train"),
         views("test"),
         val=views("val"),
-        cloud=placement.cloud,
-        depths=placement.depths,
+        cloud=cloud,
+        depths=depths,
         normalization=whole,
         scale=1.0 if fit is None else fit.scale,
         warnings=tuple(warnings),

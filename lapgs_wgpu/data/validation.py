@@ -49,8 +49,8 @@ FEW_TIMES = 5  # fewer distinct times do not constrain motion
 GAP, GAP_FACTOR = 0.1, 4.0  # a gap is longer than this share of the clip, and than this multiple of the usual step
 
 
-def upright(frames: Sequence[Frame]) -> tuple[list[Frame], list[str]]:
-    """Turn images as their EXIF orientation says where only that fits their camera; return warnings where both fit."""
+def upright(frames: Sequence[Frame], warnings: list[str]) -> list[Frame]:
+    """Turn images as their EXIF orientation says where only that fits their camera. Appends a warning where both do."""
     turned, unclear = [], []
     for frame in frames:
         image = frame.image
@@ -61,13 +61,13 @@ def upright(frames: Sequence[Frame]) -> tuple[list[Frame], list[str]]:
             elif shown == stored or not frame.states_size:
                 unclear.append(image)
         turned.append(frame)
-    if not unclear:
-        return turned, []
-    return turned, [
-        f"{len(unclear)} of {len(frames)} images, such as {unclear[0]}, have an EXIF orientation "
-        f"({unclear[0].orientation}), and no size or principal point tells whether the poses are those of the turned "
-        "images: they are taken as they are stored; else, turn the files themselves and remove the orientation."
-    ]
+    if unclear:
+        warnings.append(
+            f"{len(unclear)} of {len(frames)} images, such as {unclear[0]}, have an EXIF orientation "
+            f"({unclear[0].orientation}), and no size or principal point tells whether the poses are those of the "
+            "turned images: they are taken as they are stored; else, turn the files and remove the orientation."
+        )
+    return turned
 
 
 def check_depth(images: Sequence[ImageFile]) -> list[str]:

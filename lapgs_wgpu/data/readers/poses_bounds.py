@@ -138,19 +138,14 @@ def _recordings(folder: Path, image_size: int | None) -> dict[Path, list[ImageFi
     films = [child for child in children if child.suffix.lower() == ".mp4"]
     folders = [child for child in children if (child / IMAGES).is_dir()]
     cameras = {child.stem for child in (*films, *folders)}
-    if len(cameras) < 2:
-        raise InputError(
-            f"{folder} holds the recordings of {len(cameras)} cameras, cam00.mp4, ... or cam00/images/*.png, ...; "
-            "at least 2 are needed: one for testing, one for training."
-        )
-    if len(folders) == len(cameras):
+    if len(folders) == len(cameras) >= 2:
         return {path: _images(path / IMAGES) for path in folders}
-    if len(films) < len(cameras):
-        raise InputError(
-            f"{folder} holds films of {len(films)} cameras and images of {len(folders)}, and either must be of all "
-            f"{len(cameras)}; add what is missing."
-        )
-    return {path: unpacked(path, image_size) for path in films}
+    if len(films) == len(cameras) >= 2:
+        return {path: unpacked(path, image_size) for path in films}
+    raise InputError(
+        f"{folder} holds films of {len(films)} cameras and images of {len(folders)}; it needs cam00.mp4, ... or "
+        "cam00/images/*.png, ... of all, and of 2 at least: one for testing, one for training."
+    )
 
 
 def _images(folder: Path) -> list[ImageFile]:
