@@ -14,6 +14,7 @@ from PIL import Image, ImageFilter
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.cloud import Cloud
+from lapgs_wgpu.data.images import check_film
 from lapgs_wgpu.data.stamps import ImageName, natural_key
 from lapgs_wgpu.data.timestamps import (
     disorder,
@@ -21,7 +22,7 @@ from lapgs_wgpu.data.timestamps import (
     held_out,
     in_step,
 )
-from lapgs_wgpu.data.validation import check_film, check_in_view, check_spacing, check_times, check_views
+from lapgs_wgpu.data.validation import check_in_view, check_spacing, check_times, check_views
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
@@ -123,12 +124,12 @@ def test_cameras_of_which_none_sees_the_scene(device: Device, tmp_path: Path) ->
 def test_frames_out_of_order() -> None:
     images = [ImageName(f"frame_{i:03d}.jpg", ".") for i in range(10)]
     times = [float(i) for i in range(10)]
-    assert disorder(images, times, numbered=False) == []
+    assert disorder(images, times) == []
     times[4], times[5] = times[5], times[4]
-    (warning,) = disorder(images, times, numbered=False)
+    (warning,) = disorder(images, times)
     assert "frame_004.jpg at 5 to frame_005.jpg at 4" in warning
     images = [ImageName(f"cam{c}/{i + 10 * c:03d}.jpg", f"cam{c}") for c in range(2) for i in range(5)]
-    (warning,) = disorder(images, [float(n) for n in frame_numbers(images)], numbered=True)
+    (warning,) = disorder(images, [float(n) for n in frame_numbers(images)])
     assert "cam0 from 0 to 4" in warning, "no time in common"
 
 

@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,6 +39,7 @@ SIDEWAYS = 5  # orientations from this one on exchange width and height
 THUMBNAIL = 320  # longer side, pixels: what is blurred or equal at this size is so for a training, too
 BLURRED = 0.3  # relative to the sharpness of the images before and after
 AROUND = 5  # number of images before, and after
+NAMED = 5  # images that a warning names
 EQUAL = 3  # levels of 255: the largest difference of a repeated image, above noise at this size
 
 LANCZOS, NEAREST = Image.Resampling.LANCZOS, Image.Resampling.NEAREST
@@ -162,6 +165,27 @@ def blurred(values: NDArray[np.float64]) -> NDArray[np.bool_]:
 def repeats(gray: NDArray[np.float32], before: NDArray[np.float32]) -> bool:
     """Whether a thumbnail shows the same as the one before."""
     return gray.shape == before.shape and bool(np.abs(gray - before).max() <= EQUAL)
+
+
+def check_film(images: Sequence[Path]) -> list[str]:
+    """Warn about images of one camera, in the order of time, that are blurred or repeated. Raises InputError."""
+    if len(images) < 3:
+        return []
+    with ThreadPoolExecutor(4, thread_name_prefix="thumbnails") as pool:
+        gray = list(pool.map(gray_thumbnail, images))
+    soft = blurred(np.array([sharpness(each) for each in gray]))
+    blurry = [path.name for path, bad in zip(images, soft, strict=True) if bad]
+    same = [path.name for path, (before, now) in zip(images[1:], pairwise(gray), strict=True) if repeats(now, before)]
+    found = (
+        ("blurred", blurry, f"have less than {BLURRED:g} of their neighbours' sharpness"),
+        ("repeated", same, f"differ by at most {EQUAL} of 255 levels from the one before: motion stands still"),
+    )
+    return [
+        f"{word} images: {', '.join(names[:NAMED])}{' ...' * (len(names) > NAMED)} ({len(names)} of {len(images)}) "
+        f"{reason}; leave them out, and what names them."
+        for word, names, reason in found
+        if names
+    ]
 
 
 @contextmanager

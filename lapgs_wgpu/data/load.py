@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
-from lapgs_wgpu.data.images import SUFFIXES, Pixels, Size, shrink, shrunk_size
+from lapgs_wgpu.data.images import SUFFIXES, Pixels, Size, check_film, shrink, shrunk_size
 from lapgs_wgpu.data.lens import Lens, Undistortion
 from lapgs_wgpu.data.masks import MOSTLY, Mask, MaskKind, check_masks, find_masks, read_mask
 from lapgs_wgpu.data.normalize import Normalization
@@ -20,7 +20,7 @@ from lapgs_wgpu.data.placement import mover_cube, place
 from lapgs_wgpu.data.readers import apps, colmap, hypernerf, panoptic, poses_bounds, transforms
 from lapgs_wgpu.data.stamps import natural_key
 from lapgs_wgpu.data.timestamps import as_one_camera, by_camera, disorder, held_out, in_step, read_times
-from lapgs_wgpu.data.validation import check_cloud, check_depth, check_film, check_frames, check_views, upright
+from lapgs_wgpu.data.validation import check_cloud, check_depth, check_frames, check_views, upright
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
@@ -171,7 +171,7 @@ def _timed(folder: Path, capture: Capture, warnings: list[str]) -> tuple[list[Fr
         times, source = read_times(names, folder)
     if capture.own_footage:
         names = as_one_camera(names, times, [frame.place for frame in capture.frames])
-        warnings += disorder(names, times, numbered=source.startswith("the frame numbers"))
+        warnings += disorder(names, times)
         times = in_step(names, times)
     first, last = capture.time_range or (min(times), max(times))
     times = [(time - first) / (last - first) if last > first else 0.0 for time in times]

@@ -139,16 +139,13 @@ def frame_numbers(names: Sequence[ImageName]) -> list[int]:
     return found
 
 
-def disorder(names: Sequence[ImageName], times: Sequence[float], *, numbered: bool) -> list[str]:
-    """Warn about cameras whose times decrease with the frame number, and about cameras that do not film together.
-
-    numbered: whether the times are frame numbers.
-    """
+def disorder(names: Sequence[ImageName], times: Sequence[float]) -> list[str]:
+    """Warn about cameras whose times decrease with the frame number, and about cameras that do not film together."""
     warnings = []
     cameras = by_camera(names)
     for mine in cameras.values():
         own = [names[i] for i in mine]
-        if numbered or clock_times(own):
+        if clock_times(own):
             continue
         with suppress(InputError):  # names without a frame number have no order
             ordered = [i for _, i in sorted(zip(frame_numbers(own), mine, strict=True))]

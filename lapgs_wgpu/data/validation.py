@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -18,18 +16,7 @@ from lapgs_wgpu.data.cloud import Cloud, in_view, views_of
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.focus import FAR_APART, degrees_apart, spread
 from lapgs_wgpu.data.frames import Frame
-from lapgs_wgpu.data.images import (
-    BLURRED,
-    EQUAL,
-    ImageFile,
-    blurred,
-    decode,
-    gray_thumbnail,
-    repeats,
-    scales_to,
-    sharpness,
-    size_text,
-)
+from lapgs_wgpu.data.images import ImageFile, decode, scales_to, size_text
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.placement import near_focus
 from lapgs_wgpu.data.poses import AXES_HINT
@@ -42,7 +29,6 @@ MIN_FOCAL, MAX_FOCAL = 0.05, 1000.0  # of an image's longer side: 169 and 0.06 d
 MIN_SEEN = 0.5
 LOOKED_AT, DARK = 8, 64  # images of 16 bits that are decoded, and the level that a bright one of them reaches
 MIN_SPREAD = 1e-3  # of the cloud, relative to its distance from the cameras: a smaller one covers less than a pixel
-NAMED = 5  # images that a warning names
 STANDING = 0.01  # cameras with a spread below this, relative to their distance from the cloud, have no parallax
 FEW_POINTS = 100
 FEW_TIMES = 5  # fewer distinct times do not constrain motion
@@ -241,27 +227,3 @@ def check_views(cloud: Cloud, cameras: Sequence[Camera], where: Path) -> list[st
             "so depth cannot be told; walk around what moves."
         )
     return warnings
-
-
-def check_film(images: Sequence[Path]) -> list[str]:
-    """Warn about images of one camera, in the order of time, that are blurred or repeated."""
-    if len(images) < 3:
-        return []
-    with ThreadPoolExecutor(4, thread_name_prefix="thumbnails") as pool:
-        gray = list(pool.map(gray_thumbnail, images))
-    soft = blurred(np.array([sharpness(each) for each in gray]))
-    repeated = [path for path, (before, now) in zip(images[1:], pairwise(gray), strict=True) if repeats(now, before)]
-    found = (
-        (
-            "blurred",
-            [path for path, bad in zip(images, soft, strict=True) if bad],
-            f"have less than {BLURRED:g} of their neighbours' sharpness",
-        ),
-        ("repeated", repeated, f"differ by at most {EQUAL} of 255 levels from the one before: motion stands still"),
-    )
-    return [
-        f"{word} images: {', '.join(path.name for path in paths[:NAMED])}{' ...' * (len(paths) > NAMED)} "
-        f"({len(paths)} of {len(images)}) {reason}; leave them out, and what names them."
-        for word, paths, reason in found
-        if paths
-    ]
