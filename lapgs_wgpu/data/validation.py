@@ -1,7 +1,4 @@
-"""Validate a capture before training. Errors and warnings name the numbers, and what to change.
-
-A capture that cannot be trained on raises InputError; otherwise each problem is a warning of one sentence.
-"""
+"""Validate a capture before training: what prevents it raises InputError, other problems are warnings."""
 
 from __future__ import annotations
 
@@ -71,10 +68,7 @@ def check_depth(images: Sequence[ImageFile]) -> list[str]:
 
 
 def check_frames(frames: Sequence[Frame]) -> None:
-    """Check that all images have one size, and that each lens has plausible focal lengths and the image's proportions.
-
-    Raises InputError.
-    """
+    """Raise InputError unless all images have one size, and all lenses its proportions and plausible focal lengths."""
     first, by_lens = frames[0].image, dict[Lens, Frame]()
     for frame in frames:
         by_lens.setdefault(frame.lens, frame)

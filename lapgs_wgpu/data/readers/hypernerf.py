@@ -1,7 +1,6 @@
 """Reader of the HyperNeRF format, the layout of nerfies.
 
-scene.json, dataset.json, metadata.json, camera/ID.json and rgb/Nx/ID.png; optional are points.npy and points3D*.ply.
-docs/data.md lists the fields. Cameras and points are returned in the coordinates of scene.json: (p - center) scale.
+docs/data.md lists the files. Cameras and points are returned in the coordinates of scene.json: (p - center) scale.
 """
 
 from __future__ import annotations
