@@ -76,7 +76,7 @@ def train(
     if not dataset.test:
         raise InputError(f"{dataset.name} has no test view, by which a run is measured; add images to the capture.")
     found = check_times(dataset, moving=config.field.kind != "static") + check_spacing(dataset)
-    check_in_view(dataset, first_points(dataset, PROBES, config.points.box, config.seed)[0])
+    found += check_in_view(dataset, first_points(dataset, PROBES, config.points.box, config.seed)[0])
     check_run_folder(out, overwrite=overwrite)
     keep_freed_memory()
     device = device or open_device()

@@ -81,7 +81,7 @@ def test_png_keeps_every_bit(shape: tuple[int, ...], tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(encode_png(image))
     expected = image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
     np.testing.assert_array_equal(decode(tmp_path / "a.png"), expected)
-    assert check_image(tmp_path / "a.png") == ImageFile(tmp_path / "a.png", (shape[1], shape[0]))
+    assert check_image(tmp_path / "a.png") == ImageFile(tmp_path / "a.png", (shape[1], shape[0]), alpha=shape[-1] == 4)
 
 
 @pytest.mark.parametrize(("name", "what"), [("walk/IMG_1.JPG", "images"), ("walk.mp4", "films")])

@@ -182,9 +182,27 @@ def test_gray_of_sixteen_bits(tmp_path: Path) -> None:
     np.testing.assert_array_equal(gray_thumbnail(Path(data.train[0].source)), levels)
 
 
-def test_other_formats_are_refused_whatever_the_file_is_called(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"0\.jpg is not a readable PNG or JPEG"):
+@pytest.mark.parametrize(("alpha", "clear"), [(0, True), (1, True), (255, False)])
+def test_images_that_are_transparent(tmp_path: Path, alpha: int, clear: bool) -> None:
+    def write(image: NDArray[np.uint8], path: Path) -> None:
+        Image.fromarray(np.dstack([image, np.full((HEIGHT, WIDTH), alpha, np.uint8)])).save(path)
+
+    assert told(load_dataset(capture(tmp_path / "clear", write)), "nearly transparent") == clear
+
+
+def test_format_is_named_whatever_the_file_is_called(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="WebP"):
         load_dataset(capture(tmp_path / "webp", lambda i, p: Image.fromarray(i).save(p, "WEBP"), suffix="jpg"))
+    heads = {"HEIC": b"\0\0\0\x18ftypheic", "Git LFS": b"version https://git-lfs.github.com/spec/v1\n", "empty": b""}
+    for word, head in heads.items():
+        with pytest.raises(InputError, match=word):
+            load_dataset(capture(tmp_path / word, lambda _, path, head=head: path.write_bytes(head), suffix="jpg"))
+
+
+@pytest.mark.parametrize("share", [0.25, 0.5, 1.0])
+def test_principal_point_of_another_size(tmp_path: Path, share: float) -> None:
+    data = load_dataset(capture(tmp_path / "other", cx=share * WIDTH, cy=share * HEIGHT))
+    assert told(data, "principal point") == (share != 0.5)
 
 
 LEFT = np.where(np.arange(WIDTH) < 20, 0, 255).astype(np.uint8) * np.ones((HEIGHT, 1), np.uint8)  # 20 columns go

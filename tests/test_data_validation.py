@@ -41,10 +41,12 @@ def turned(camera: Camera) -> Camera:
 
 def test_cameras_that_look_away_or_do_not_move() -> None:
     def warnings(taken: list[Camera]) -> list[str]:
-        return check_views(CLOUD, taken, Path("points3D.bin"))
+        return check_views(CLOUD, {each: f"{i}.png" for i, each in enumerate(taken)}, Path("points3D.bin"))
 
     taken = cameras(6)
     assert warnings(taken) == []
+    (warning,) = warnings([*taken[:2], turned(taken[2]), *taken[3:]])
+    assert "2.png" in warning
     (warning,) = warnings([taken[1]] * 3)
     assert "hardly move" in warning
     with pytest.raises(InputError, match=r"points3D\.bin: .* 4 of 6"):
@@ -112,10 +114,18 @@ def test_still_cameras_far_apart(count: int, told: str) -> None:
     assert found == [] if not told else told in found[0]
 
 
-def test_cameras_of_which_none_sees_the_scene(device: Device, tmp_path: Path) -> None:
-    times, taken = np.linspace(0, 1, 11), [turned(camera) for camera in cameras(11)]
-    check_in_view(timed(times, taken=[*taken[:10], cameras(1)[0]]), CLOUD.points)
-    none = timed(times, taken=taken)
+def test_cameras_that_look_away_for_a_while(device: Device, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    times, taken = np.linspace(0, 1, 11), cameras(11)
+    assert check_in_view(timed(times, taken=taken), CLOUD.points) == []
+    for i in (1, 4, 5, 6):
+        taken[i] = turned(taken[i])
+    (warning,) = check_in_view(timed(times, taken=taken), CLOUD.points)
+    assert "at 4 of 11 times: train_1, train_4, train_5, train_6" in warning
+    together = timed(np.repeat(times, 2), taken=[camera for one in taken for camera in (one, cameras(1)[0])])
+    assert check_in_view(together, CLOUD.points) == [], "another camera sees it"
+    train(load_config("tiny", FAST), timed(times, taken=taken), tmp_path / "run", device=device)
+    assert warning in capsys.readouterr().err
+    none = timed(times, taken=[turned(camera) for camera in cameras(11)])
     with pytest.raises(InputError, match="none of 11 training cameras"):
         train(load_config("tiny", FAST), none, tmp_path / "none", device=device)
     assert not (tmp_path / "none").exists()

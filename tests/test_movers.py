@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.captures import bright, write_colmap
+from helpers.captures import bright, write_colmap, write_rig
 from helpers.films import Board, drawn, room_cloud, walk
 from PIL import Image
 
@@ -128,6 +128,13 @@ def test_a_hard_film_trains(
     assert np.isfinite(losses).all()
     assert 3 < measured["psnr"] < 60
     assert (measured["psnr_moving"] == "not available") == (level == 0)
+
+
+def test_a_black_camera_of_a_rig_is_told(tmp_path: Path, device: Device) -> None:
+    capture = write_rig(tmp_path / "rig", device)
+    assert not any("are black" in warning for warning in load_dataset(capture).warnings)
+    change_images(sorted((capture / "images" / "cam02").glob("*.png")), lambda i, pixels: pixels * 0)
+    assert any("1 of 4 cameras are black, such as cam02" in warning for warning in load_dataset(capture).warnings)
 
 
 def test_a_film_starts_from_its_masks(tmp_path: Path, device: Device) -> None:

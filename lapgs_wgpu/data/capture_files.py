@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import unicodedata
 from functools import cached_property
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -15,6 +16,7 @@ from lapgs_wgpu.errors import InputError, shown
 from lapgs_wgpu.io.listing import is_desktop_file
 
 MOST_ABSENT = 0.2  # share of the images of a capture that may be absent: whoever deletes blurred ones deletes fewer
+_SMALLER = re.compile(r"(.*/)?images(_\d+)?/")  # folders of smaller images, as other programs write them
 
 
 def files_below(folder: Path) -> list[str]:
@@ -42,10 +44,10 @@ class CaptureFiles:
     def find(self, name: str) -> str | None:
         """Return the path of an existing file relative to the folder, with slashes; None if there is none.
 
-        The name may differ from the file's in slashes, number of blanks (also %20), Unicode form, letter case, and
-        .jpeg for .jpg. Of one that leads out of the folder, as it was written elsewhere, or begins
-        with the folder's own name, the end that is a file in the folder counts. The file whose name is the same goes
-        before others.
+        The name may differ from the file's in slashes, number of blanks (also %20), Unicode form, letter case, .jpeg
+        for .jpg, and, where its folder does not exist, images_4 for images. Of one that leads out of the folder, as it
+        was written elsewhere, or begins with the folder's own name, the end that is a file in the folder counts. The
+        file whose name is the same goes before others.
         """
         path = os.path.relpath(self.folder / name, self.folder)
         if os.path.isfile(self.folder / name) and not path.startswith(".."):  # Path.is_file raises for long names
@@ -57,12 +59,20 @@ class CaptureFiles:
         for key in ("/".join(parts[start:]) for start in starts):
             if found := self._by_name.get(key):
                 return found
+            images = _SMALLER.match(key)
+            if images and not os.path.isdir(self.folder / images[0]) and (found := self._smaller.get(_in_images(key))):
+                return found
         return self.find(unquote(name)) if unquote(name) != name else None
 
     @cached_property
     def _by_name(self) -> dict[str, str]:
         """The files by their folded names."""
         return {_folded(path): path for path in reversed(files_below(self.folder))}
+
+    @cached_property
+    def _smaller(self) -> dict[str, str]:
+        """The same, with images for images_4."""
+        return {_in_images(name): path for name, path in self._by_name.items()}
 
     def find_image(self, name: str, named: str) -> str | None:
         """As `find`, of an image, whose name may lack the suffix. If there is none, a sentence goes to `absent`.
@@ -125,6 +135,10 @@ def _leads_out(name: str) -> bool:
         system(name).anchor or ".." in system(os.path.normpath(name)).parts
         for system in (PurePosixPath, PureWindowsPath)
     )
+
+
+def _in_images(name: str) -> str:
+    return _SMALLER.sub(r"\1images/", name)
 
 
 def _folded(name: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.io.ply_elements import Floats, open_ply, read_colors
+from lapgs_wgpu.io.ply_elements import BAD_SHARE, Floats, open_ply, read_colors
 from lapgs_wgpu.splat.camera import Camera
 
 Array = NDArray[np.float64]
@@ -53,12 +54,14 @@ def read_cloud(path: Path) -> Cloud:
         raise InputError(f"{path} must hold at least one point of 3 numbers, an array of (N, 3), got {points.shape}.")
     points = points.astype(np.float64)  # float32 would round what lies far from the origin, before it is centered
     bad = np.flatnonzero(~(np.abs(points) <= np.finfo(np.float32).max).all(axis=1))  # true for NaN, too
-    if len(bad):
-        raise InputError(
-            f"{path} holds NaN or infinite coordinates in {len(bad)} of {len(points)} points, first in point {bad[0]}; "
-            "remove them."
-        )
-    return Cloud(points, np.full(points.shape, 0.5, np.float32) if colors is None else colors)
+    cloud = Cloud(points, np.full(points.shape, 0.5, np.float32) if colors is None else colors)
+    if not len(bad):
+        return cloud
+    told = f"{path} holds NaN or infinite coordinates in {len(bad)} of {len(points)} points"
+    if len(bad) > BAD_SHARE * len(points):
+        raise InputError(f"{told}, first in point {bad[0]}; remove them.")
+    print(f"note: {told}, which are left out.", file=sys.stderr)
+    return Cloud(np.delete(cloud.points, bad, axis=0), np.delete(cloud.colors, bad, axis=0))
 
 
 def read_points(path: Path) -> tuple[NDArray[np.float64], Floats | None]:
@@ -70,7 +73,14 @@ def read_points(path: Path) -> tuple[NDArray[np.float64], Floats | None]:
         vertex = ply.elements.get("vertex")
         if vertex is None or not {"x", "y", "z"} <= set(vertex.properties):
             raise InputError(f"{path}: has no element vertex with properties x, y, z, so it is no cloud of points.")
-        return ply.columns(vertex, ["x", "y", "z"], np.float64), read_colors(ply, vertex)
+        points, colors = ply.columns(vertex, ["x", "y", "z"], np.float64), read_colors(ply, vertex)
+        others = [name for name in vertex.properties if name not in ("x", "y", "z", "nx", "ny", "nz")]
+        if colors is None and others:
+            print(
+                f"note: {path}: no colors are known in the properties {', '.join(others[:5])}; points start gray.",
+                file=sys.stderr,
+            )
+        return points, colors
 
 
 def read_npy(path: Path) -> NDArray[np.floating]:

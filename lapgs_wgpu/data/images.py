@@ -7,6 +7,7 @@ without decoding the image, verify checksums, restrict the formats, decode a JPE
 from __future__ import annotations
 
 import math
+import re
 import struct
 import zlib
 from collections.abc import Iterator, Sequence
@@ -21,7 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from lapgs_wgpu.data.evenly import some
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.io.ply_elements import LFS_POINTER
 
 Pixels = NDArray[np.uint8]
 Size = tuple[int, int]  # (width, height) in pixels
@@ -33,13 +36,17 @@ _ERRORS = (  # what Pillow raises; the last five for damage that it takes for va
     IndexError, KeyError, TypeError, struct.error, zlib.error,
 )  # fmt: skip
 _MODES = {"1", "L", "LA", "P", "PA", "RGB", "RGBA", "I;16", "I"}  # the last two: gray PNG of 16 bits
+_OTHERS = re.compile(  # first bytes of other formats
+    rb"(?P<WebP>.{8}WEBP)|(?P<HEIC>.{4}ftyp(hei|mif1|msf1))|(?P<AVIF>.{4}ftypavi)|(?P<TIFF>II\*\0|MM\0\*)|(?P<GIF>GIF8)"
+    rb"|(?P<BMP>BM)|(?P<OpenEXR>\x76\x2f\x31\x01)|(?P<JPEG_XL>\xff\x0a|.{4}JXL )",
+    re.DOTALL,
+)
 _ORIENTATION = 0x0112  # EXIF's tag
 SIDEWAYS = 5  # orientations from this one on exchange width and height
 
 THUMBNAIL = 320  # longer side, pixels: what is blurred or equal at this size is so for a training, too
 BLURRED = 0.3  # relative to the sharpness of the images before and after
 AROUND = 5  # number of images before, and after
-NAMED = 5  # images that a warning names
 EQUAL = 3  # levels of 255: the largest difference of a repeated image, above noise at this size
 
 LANCZOS, NEAREST = Image.Resampling.LANCZOS, Image.Resampling.NEAREST
@@ -49,14 +56,15 @@ class ImageFile(NamedTuple):
     """An image file whose header was checked.
 
     size: (width, height) in pixels. orientation: as EXIF states it, 1 to 8; 1 is upright. deep: whether it has 16 bits
-    per channel, of which the upper 8 are read. upright: whether `read` turns it as `orientation` says. source: where it
-    comes from if not from a file of the capture, for errors.
+    per channel, of which the upper 8 are read. alpha: whether it states opacities. upright: whether `read` turns it as
+    `orientation` says. source: where it comes from if not from a file of the capture, for errors.
     """
 
     path: Path
     size: Size
     orientation: int = 1
     deep: bool = False
+    alpha: bool = False
     upright: bool = False
     source: str = ""
 
@@ -102,15 +110,34 @@ def check_image(path: Path, *, whole: bool = True) -> ImageFile:
             exif = file.format != "PNG" or "exif" in file.info  # else Pillow would decode a PNG to look for more
             orientation = file.getexif().get(_ORIENTATION, 1) if exif else 1
             deep = file.format == "PNG" and "16" in str(file.tile[0][3])
+            alpha = _has_alpha(file)
             if whole:
                 file.verify()
+    except Image.UnidentifiedImageError:
+        raise InputError(f"{path} {_content(path)}") from None
     except _ERRORS as reason:
-        raise InputError(
-            f"{path} is not a readable PNG or JPEG ({reason}); convert it, or copy or render it again."
-        ) from None
+        raise InputError(f"{path} is not a readable image ({reason}); copy or render it again.") from None
     if mode not in _MODES:
         raise InputError(f"{path} has pixels of mode {mode}; save it as RGB or RGBA with 8 bits per channel.")
-    return ImageFile(path, size, orientation if orientation in range(1, 9) else 1, deep)
+    return ImageFile(path, size, orientation if orientation in range(1, 9) else 1, deep, alpha)
+
+
+def _has_alpha(file: Image.Image) -> bool:
+    """Whether `decode` returns opacities."""
+    return not file.mode.startswith("I") and ("A" in file.getbands() or "transparency" in file.info)
+
+
+def _content(path: Path) -> str:
+    """What a file that is neither PNG nor JPEG holds, and what to do, for errors."""
+    with path.open("rb") as file:
+        head = file.read(64)
+    if not head:
+        return "is empty (0 bytes); copy or render it again."
+    if head.startswith(LFS_POINTER):
+        return "is a pointer of Git LFS in place of the image; fetch it by git lfs pull."
+    if other := _OTHERS.match(head):
+        return f"holds an image in the format {other.lastgroup}, whatever its name; convert it to PNG or JPEG."
+    return "is not a readable image (neither PNG nor JPEG); copy or render it again."
 
 
 def decode(path: Path) -> Pixels:
@@ -120,7 +147,7 @@ def decode(path: Path) -> Pixels:
     """
     with _decoding(path), open(path, "rb") as file:  # not the path: imageio would look into archives
         header = Image.open(file, formats=_FORMATS)
-        transparent = "A" in header.getbands() or "transparency" in header.info
+        transparent = _has_alpha(header)
         if header.mode.startswith("I"):  # Pillow clips 16 bits of gray, and takes the upper 8 of RGB
             gray = (np.asarray(header) >> 8).astype(np.uint8)
             return np.repeat(gray[..., None], 3, axis=2)
@@ -181,8 +208,7 @@ def check_film(images: Sequence[Path]) -> list[str]:
         ("repeated", same, f"differ by at most {EQUAL} of 255 levels from the one before: motion stands still"),
     )
     return [
-        f"{word} images: {', '.join(names[:NAMED])}{' ...' * (len(names) > NAMED)} ({len(names)} of {len(images)}) "
-        f"{reason}; leave them out, and what names them."
+        f"{word} images: {some(names)} ({len(names)} of {len(images)}) {reason}; leave them out, and what names them."
         for word, names, reason in found
         if names
     ]

@@ -20,7 +20,7 @@ from lapgs_wgpu.data.placement import mover_cube, place
 from lapgs_wgpu.data.readers import apps, colmap, hypernerf, panoptic, poses_bounds, transforms
 from lapgs_wgpu.data.stamps import natural_key
 from lapgs_wgpu.data.timestamps import as_one_camera, by_camera, disorder, held_out, in_step, read_times
-from lapgs_wgpu.data.validation import check_cloud, check_depth, check_frames, check_views, upright
+from lapgs_wgpu.data.validation import check_cloud, check_frames, check_plausible, check_views, upright
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
@@ -67,7 +67,7 @@ def load_dataset(
         frames = [dataclasses.replace(frame, lens=frame.lens.idealized) for frame in frames]
     warnings = list(capture.warnings)
     frames = upright(frames, warnings)
-    warnings += check_depth([frame.image for frame in frames])
+    warnings += check_plausible(frames)
     frames, time_source = _timed(folder, dataclasses.replace(capture, frames=frames), warnings)
     check_frames(frames)
     own_masks, own_movers = None if masks is None else Path(masks), None if movers is None else folder / movers
@@ -79,7 +79,8 @@ def load_dataset(
     training_cameras = list(dict.fromkeys(camera for camera, _ in training))
     if capture.cloud is not None:
         if capture.own_footage:
-            warnings += check_views(capture.cloud, list(dict.fromkeys(cameras)), capture.source)
+            named = {camera: frame.name.file for camera, frame in zip(cameras, frames, strict=True)}
+            warnings += check_views(capture.cloud, named, capture.source)
         seen_cloud = check_cloud(capture.cloud, training_cameras, capture.source, warnings)
         capture = dataclasses.replace(capture, cloud=seen_cloud)
     moving = None
@@ -128,13 +129,13 @@ def _summary(
     number = places if still else len({frame.name.camera for frame in frames})
     told = f"{number} {'still' if still else 'moving'} camera{'s' * (number > 1)}"
     times = len({frame.time for frame in frames})
-    held = sum(frame.split != "train" for frame in frames)
+    held = [frame.name.camera for frame in frames if frame.split != "train"]
+    trained = {frame.name.camera for frame in frames if frame.split == "train"}
+    one = len({*held}) == 1 and held[0] not in trained
+    out = f"{held[0]} is" if one else f"{len(held)} of {len(frames)} images are"
     scale = "coordinates are kept" if moved is None else f"1 unit of the files becomes {moved.scale:.4g}"
     left_out = f"; {capture.left_out} left out" if capture.left_out else ""
-    return (
-        f"{layout}, {told}, {times} times from {time_source}; {held} of {len(frames)} images are held out; "
-        f"{scale}{left_out}"
-    )
+    return f"{layout}, {told}, {times} times from {time_source}; {out} held out; {scale}{left_out}"
 
 
 def _reader(folder: Path) -> Reader:
@@ -151,6 +152,8 @@ def _reader(folder: Path) -> Reader:
     children = sorted(child for child in folder.iterdir() if child.is_dir())
     scenes = [child.name for child in children if any(reader.matches(child) for reader in READERS)]
     inside = f"; it holds the scenes {', '.join(scenes[:8])}: name one of them" if scenes else ""
+    if any(reader.matches(folder.resolve().parent) for reader in READERS):
+        inside = f"; its parent folder {folder.resolve().parent} is one: name that"
     held = {path.suffix.lower() for pattern in ("*.*", "*/*.*") for path in folder.glob(pattern)}
     if not inside and not held.isdisjoint((*SUFFIXES, *FILMS)):
         inside = (

@@ -17,12 +17,14 @@ TIME_WORDS = {"frame", "fr", "time", "timestep", "timestamp", "ts", "t", "step",
 CAMERA_WORDS = {"cam", "camera", "c", "view", "kinect", "device"}
 FILLED = 1.25  # of the images: cameras times their moments, where a fifth of these may lack an image
 STILL = 0.02  # of the distance of cameras: the places of one that stands still are apart by less
-_CLOCK = re.compile(  # 20260110_095848, 2026-01-10 9.58.48, 09-58-48; digits after that are parts of a second
+_CLOCK = re.compile(  # 20260110_095848, 2026-01-10 at 9.58.48 PM, 09-58-48; digits after that are parts of a second
     r"(?<!\d)(?:(?P<date>(?:19|20)\d\d([-_.]?)\d\d\2\d\d)\D{0,4})?"
     r"(?P<hour>\d\d|(?<!\d)\d(?=[-_.:]))(?P<by>[-_.:]?)(?P<minute>\d\d)(?P=by)(?P<second>\d\d)"
-    r"(?:[-_.]?(?P<part>\d{3}|\d{6}))?(?!\d)"
+    r"(?:[-_.]?(?P<part>\d{3}|\d{6}))?(?!\d)(?:\s?(?P<half>[AaPp])[Mm]\b)?"
 )
+_UNIX = re.compile(r"(?<!\d)(1\d{9})[-_.](\d{3,9})(?!\d)")
 _DECIMAL = re.compile(r"(?:(?<![\w.])|(?<=[_-]))(\d+(?:\.(\d+))?)s?(?![\w.])")  # 0.25, t_0.25, 0.25s
+_DAY = 86400.0  # seconds
 
 
 class ImageName(NamedTuple):
@@ -137,13 +139,15 @@ def stand_still(names: Iterable[ImageName], places: Mapping[str, NDArray[np.floa
 
 
 def clock_times(names: Sequence[ImageName]) -> tuple[list[float], str] | None:
-    """Return the times in seconds that all names state, and what they are; None if these are neither clock times nor
-    decimals, or if two images of a camera have the same."""
+    """Return the times in seconds that all names state, and what they are; None if these are no clock times, Unix
+    times or decimals, or if two images of a camera have the same."""
     matches = [match for name in names if (match := _CLOCK.search(name.stamp))]
     clocks = [clock for match in matches if (clock := _seconds(match)) is not None]
     dated = {match["date"] is not None for match in matches} if len(clocks) == len(names) else set()
+    unix = [float(f"{found[1]}.{found[2]}") for name in names if (found := _UNIX.search(name.stamp))]
     readings = (
         (clocks if dated == {True} else None, "clock times"),
+        (unix if len(unix) == len(names) else None, "Unix times"),
         (_times_of_day(names, matches, clocks) if dated == {False} else None, "clock times (HHMMSS)"),
         (_decimals([name.stamp for name in names]), "seconds"),
     )
@@ -156,6 +160,8 @@ def clock_times(names: Sequence[ImageName]) -> tuple[list[float], str] | None:
 def _seconds(found: re.Match[str]) -> float | None:
     """Seconds of a match of _CLOCK, from its midnight where it has no date; None where it is no possible time."""
     hour, minute, second = (int(found[part]) for part in ("hour", "minute", "second"))
+    if found["half"]:
+        hour = hour % 12 + 12 * (found["half"] in "Pp")
     try:
         midnight = datetime.strptime(re.sub(r"\D", "", found["date"] or "19700101"), "%Y%m%d").replace(tzinfo=UTC)
     except ValueError:  # 20261399_000001
@@ -168,13 +174,17 @@ def _seconds(found: re.Match[str]) -> float | None:
 def _times_of_day(
     names: Sequence[ImageName], matches: Sequence[re.Match[str]], clocks: Sequence[float]
 ) -> list[float] | None:
-    """Seconds of HHMMSS without a date; None unless they are alike in all else that the names of a camera hold, and
-    more even as times than as numbers, which jump by 40 each minute."""
+    """Seconds of HHMMSS without a date, also past midnight; None unless they are alike in all else that the names of a
+    camera hold, and more even as times than as numbers, which jump by 40 each minute."""
     around = {(name.camera, _CLOCK.sub("", name.stamp, count=1)) for name in names}
     if len(around) > len({name.camera for name in names}):
         return None
+    ordered = np.sort(clocks)
+    pauses = np.diff(ordered, prepend=ordered[0])
+    evening = ordered[np.argmax(pauses)] if pauses.max() > _DAY / 2 else ordered[0]
+    times = [clock if clock >= evening else clock + _DAY for clock in clocks]
     numbers = [float(re.sub(r"\D", "", match[0])) for match in matches]
-    return list(clocks) if _unevenness(clocks) < _unevenness(numbers) else None
+    return times if _unevenness(times) < _unevenness(numbers) else None
 
 
 def _unevenness(values: Sequence[float]) -> float:

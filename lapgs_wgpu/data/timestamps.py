@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_wgpu.data.evenly import some
 from lapgs_wgpu.data.json_fields import number, read_json
 from lapgs_wgpu.data.stamps import STILL, ImageName, clock_times, natural_key
 from lapgs_wgpu.errors import InputError
@@ -161,11 +162,13 @@ def disorder(names: Sequence[ImageName], times: Sequence[float]) -> list[str]:
     step = max(time_step(np.unique([times[i] for i in mine])) for mine in cameras.values())
     longest = max(1.5 * step, APART * (max(times) - min(times)))
     if any(max(ends) - min(ends) > longest for ends in zip(*spans.values(), strict=True)):
-        first_camera, (a, b) = next(iter(spans.items()))
-        other, (c, d) = max(spans.items(), key=lambda item: max(abs(item[1][0] - a), abs(item[1][1] - b)))
+        alike = dict[tuple[float, float], list[str]]()
+        for camera, span in spans.items():
+            alike.setdefault(span, []).append(camera)
+        told = (f"{some(cameras)} from {a:g} to {b:g}" for (a, b), cameras in alike.items())
         warnings.append(
-            f"cameras film at different times: {first_camera} from {a:g} to {b:g} and {other} from {c:g} to {d:g}; if "
-            f"some film more images a second, or were started apart, write the times in seconds into {TIMES}."
+            f"cameras film at different times: {', '.join(told)}; if some film more images a second, or were started "
+            f"apart, write the times in seconds into {TIMES}."
         )
     return warnings
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.cloud import Cloud, in_view, views_of
-from lapgs_wgpu.data.evenly import evenly
+from lapgs_wgpu.data.evenly import evenly, some
 from lapgs_wgpu.data.focus import FAR_APART, degrees_apart, spread
 from lapgs_wgpu.data.frames import Frame
 from lapgs_wgpu.data.images import ImageFile, decode, scales_to, size_text
@@ -24,7 +24,9 @@ from lapgs_wgpu.splat.camera import Camera
 MIN_FOCAL, MAX_FOCAL = 0.05, 1000.0  # of an image's longer side: 169 and 0.06 degrees of view
 # A triangulated point was seen by cameras. If most points are not, cloud and cameras use different coordinates.
 MIN_SEEN = 0.5
-LOOKED_AT, DARK = 8, 64  # images of 16 bits that are decoded, and the level that a bright one of them reaches
+OFF_CENTER = 0.15  # of a side: intrinsics of images half or twice as large lie 0.25 or 0.5 away from the middle
+LOOKED_AT, DARK = 8, 64  # images of 16 bits or with alpha that are decoded, and the level that one of them reaches
+BLACK_AT, BLACK = 3, 16  # the same for the images of a camera
 MIN_SPREAD = 1e-3  # of the cloud, relative to its distance from the cameras: a smaller one covers less than a pixel
 STANDING = 0.01  # cameras with a spread below this, relative to their distance from the cloud, have no parallax
 FEW_POINTS = 100
@@ -53,17 +55,57 @@ def upright(frames: Sequence[Frame], warnings: list[str]) -> list[Frame]:
     return turned
 
 
-def check_depth(images: Sequence[ImageFile]) -> list[str]:
-    """Warn about images of 16 bits that are nearly black, since they use fewer."""
-    deep = [image for image in images if image.deep]
-    looked_at = evenly(deep, LOOKED_AT)
-    highest = max((int(decode(image.path)[..., :3].max()) for image in looked_at), default=255)
-    if highest >= DARK:
-        return []
-    bits = highest.bit_length()
+def check_plausible(frames: Sequence[Frame]) -> list[str]:
+    """Warn about principal points far from the middle, about images that are nearly black, as 16 bits that use fewer
+    are, or nearly transparent, and about cameras whose images are black."""
+    warnings = []
+    off = [frame for frame in {frame.lens: frame for frame in reversed(frames)}.values() if _is_off_center(frame.lens)]
+    if off:
+        lens = off[-1].lens
+        warnings.append(
+            f"{off[-1].where}: the principal point ({lens.cx:.5g}, {lens.cy:.5g}) is far from the middle of images of "
+            f"{size_text(lens.size)}, in {len(off)} cameras; unless the images were cut out of larger ones, the "
+            "intrinsics are those of another size, or in other units than pixels."
+        )
+    highest, told = _highest([frame.image for frame in frames if frame.image.deep], slice(3))
+    if highest < DARK:
+        bits = highest.bit_length()
+        warnings.append(
+            f"images of 16 bits are nearly black: {told}, so they seem to use {8 + bits} bits; multiply them by "
+            f"{2 ** (8 - bits)}."
+        )
+    highest, told = _highest([frame.image for frame in frames if frame.image.alpha], slice(3, 4))
+    if highest < DARK:
+        warnings.append(
+            f"images are nearly transparent: the alpha, {told}, and transparent pixels count as background; save the "
+            "images without alpha."
+        )
+    return warnings + _black_cameras(frames)
+
+
+def _is_off_center(lens: Lens) -> bool:
+    return max(abs(lens.cx / lens.width - 0.5), abs(lens.cy / lens.height - 0.5)) > OFF_CENTER
+
+
+def _highest(images: Sequence[ImageFile], channels: slice, most: int = LOOKED_AT) -> tuple[int, str]:
+    """The highest level in some channels of some of the images, 255 where there are none, and a text that says it."""
+    looked_at = evenly(images, most)
+    highest = max((int(decode(image.path)[..., channels].max()) for image in looked_at), default=255)
+    such = f"in {len(looked_at)} of {len(images)}, such as {looked_at[0]}, " if looked_at else ""
+    return highest, f"{such}no level is above {highest} of 255"
+
+
+def _black_cameras(frames: Sequence[Frame]) -> list[str]:
+    films = dict[str, list[ImageFile]]()
+    for frame in frames:
+        if frame.name.camera and not frame.image.deep:
+            films.setdefault(frame.name.camera, []).append(frame.image)
+    found = {name: _highest(images, slice(3), BLACK_AT) for name, images in films.items() if len(images) > 1}
+    black = {name: told for name, (highest, told) in found.items() if highest < BLACK}
     return [
-        f"images of 16 bits are nearly black: in {len(looked_at)} of {len(deep)}, such as {looked_at[0]}, no level is "
-        f"above {highest} of 255, so they seem to use {8 + bits} bits; multiply them by {2 ** (8 - bits)}."
+        f"{len(black)} of {len(found)} cameras are black, such as {name}: {told}: "
+        f"{'leave them out' if len(found) > 1 else 'give brighter images'}."
+        for name, told in [*black.items()][:1]
     ]
 
 
@@ -86,9 +128,11 @@ def check_frames(frames: Sequence[Frame]) -> None:
                     f"{MIN_FOCAL:g} to {MAX_FOCAL:g} times the longer side, in pixels of that size."
                 )
         if not scales_to(first.size, lens.size):
+            sideways = scales_to(first.size[::-1], lens.size)
+            advice = "turn it, or give the camera of the turned image" if sideways else "give the camera of this image"
             raise InputError(
                 f"{frame.image} is {size_text(first.size)} pixels, but {frame.where} states {stated}, which has other "
-                "proportions; give the camera of this image, or turn it if it lies on its side."
+                f"proportions{', those of the image on its side' if sideways else ''}; {advice}."
             )
 
 
@@ -170,16 +214,28 @@ def _gaps(dataset: Dataset, source: str) -> list[str]:
     ]
 
 
-def check_in_view(dataset: Dataset, points: NDArray[np.floating]) -> None:
-    """Raise InputError if no training view shows any of the initial Gaussians' means (N, 3), world units."""
-    if any(in_view(points, camera)[1].any() for camera in dataset.cameras):
-        return
-    low, high = points.min(axis=0), points.max(axis=0)
-    box = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(low, high, strict=True))
-    raise InputError(
-        f"{dataset.name}: none of {len(dataset.train)} training cameras sees where the first Gaussians lie ({box} "
-        "along x, y, z); check the poses and their axes, or raise points.box and field.bound."
-    )
+def check_in_view(dataset: Dataset, points: NDArray[np.floating]) -> list[str]:
+    """Warn about times at which no training view shows the scene.
+
+    points: (N, 3) means of the initial Gaussians, world units. Raises InputError if no view shows any.
+    """
+    seeing = {camera for camera in dataset.cameras if in_view(points, camera)[1].any()}
+    if not seeing:
+        low, high = points.min(axis=0), points.max(axis=0)
+        box = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(low, high, strict=True))
+        raise InputError(
+            f"{dataset.name}: none of {len(dataset.train)} training cameras sees where the first Gaussians lie ({box} "
+            "along x, y, z); check the poses and their axes, or raise points.box and field.bound."
+        )
+    shown = {view.time for view in dataset.train if view.camera in seeing}
+    blind = [view for view in dataset.train if view.time not in shown]
+    if not blind:
+        return []
+    return [
+        f"{dataset.name}: all cameras look away at {len({view.time for view in blind})} of {len(dataset.times)} times: "
+        f"{some([view.name for view in blind])} show nothing of the scene, so its motion there is a guess; check "
+        "these poses, or remove these images."
+    ]
 
 
 def check_spacing(dataset: Dataset) -> list[str]:
@@ -194,19 +250,24 @@ def check_spacing(dataset: Dataset) -> list[str]:
     ]
 
 
-def check_views(cloud: Cloud, cameras: Sequence[Camera], where: Path) -> list[str]:
-    """Warn about cameras that hardly move, and about a sparse cloud.
+def check_views(cloud: Cloud, named: Mapping[Camera, str], where: Path) -> list[str]:
+    """Warn about cameras that see no point of the cloud or hardly move, and about a sparse cloud.
 
-    cameras: the distinct ones, in the coordinates of the cloud. Raises InputError if more than half see no point.
+    named: an image of each camera, in the coordinates of the cloud. Raises InputError if more than half see no point.
     """
-    points = cloud.points.astype(np.float64)
-    blind = sum(not in_view(points, camera)[1].any() for camera in cameras)
-    if 2 * blind > len(cameras):
+    points, cameras = cloud.points.astype(np.float64), list(named)
+    blind = [name for camera, name in named.items() if not in_view(points, camera)[1].any()]
+    if 2 * len(blind) > len(cameras):
         raise InputError(
-            f"{where}: cameras look away from the cloud: {blind} of {len(cameras)} see none of its {len(points)} "
+            f"{where}: cameras look away from the cloud: {len(blind)} of {len(cameras)} see none of its {len(points)} "
             f"points; {AXES_HINT}, or cloud and cameras have different coordinates or scales."
         )
     warnings = []
+    if blind:
+        warnings.append(
+            f"cameras look away from the cloud: {some(blind)} see none of its {len(points)} points ({len(blind)} of "
+            f"{len(cameras)} cameras); their poses may be wrong."
+        )
     if len(points) < FEW_POINTS:
         warnings.append(
             f"the cloud is sparse: {where} holds {len(points)} points (at least {FEW_POINTS} are usual); more texture, "

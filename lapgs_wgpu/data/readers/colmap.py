@@ -21,6 +21,8 @@ IMAGES, SPARSE = "images", "sparse"
 
 def _read(folder: Path, image_size: int | None) -> Capture:
     images = folder / IMAGES
+    if not images.is_dir():  # only smaller ones may be there, in images_2, images_4, ...
+        images = next(iter(sorted(folder.glob(f"{IMAGES}_*"), key=lambda path: natural_key(path.name))), images)
     if not images.is_dir():
         raise InputError(f"{images} does not exist; put the images from which COLMAP made {folder / SPARSE} there.")
     models = {path: read_model(path) for path in _models(folder)}

@@ -38,7 +38,7 @@ OTHER_MODELS = {
     14: "SIMPLE_FISHEYE", 15: "FISHEYE", 16: "EUCM", 17: "EQUIRECTANGULAR",
 }  # fmt: skip
 PARAMETERS = dict(MODELS.values())
-_NUMBERS = re.compile(r"[-+.\deE\s]*")
+_NUMBERS = re.compile(r"([-+.\deE\s]|nan|inf)*")
 
 
 class ColmapImage(NamedTuple):
@@ -163,9 +163,9 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
 
 
 def _text_images(path: Path) -> Iterator[ColmapImage]:
-    """Each is a line that ends with a name; after it mostly comes one of its points, which are numbers."""
+    """Each is a line that ends with a name; after it mostly comes one of its points, three numbers each."""
     for where, line in _lines(path):
-        if not _NUMBERS.fullmatch(line):
+        if len(line.split()) == 10 or not _NUMBERS.fullmatch(line):
             words = _words(line, where, "id, QW, QX, QY, QZ, TX, TY, TZ, camera, name", most=9)
             (camera,) = _numbers(words[8:9], where, int)
             yield _image(words[9], camera, _numbers(words[1:8], where), f"{where} ({words[9][:80]})")

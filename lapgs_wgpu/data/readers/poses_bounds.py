@@ -148,13 +148,13 @@ def _recordings(folder: Path, image_size: int | None) -> dict[Path, list[ImageFi
     )
 
 
-def _images(folder: Path) -> list[ImageFile]:
-    """Return the images of a folder, by number; of their files, which may be gigabytes, headers alone are read. Raises
+def _images(folder: Path, *, whole: bool = False) -> list[ImageFile]:
+    """Return the images of a folder, by number. whole: of `check_image`; those of a rig may be gigabytes. Raises
     InputError if there is none."""
     files = sorted((f for f in listed(folder) if f.suffix.lower() in SUFFIXES), key=lambda f: natural_key(f.name))
     if not files:
         raise InputError(f"{folder} holds no images (.png or .jpg); extract the camera's frames into it.")
-    return [check_image(file, whole=False) for file in files]
+    return [check_image(file, whole=whole) for file in files]
 
 
 # EndoNeRF
@@ -162,7 +162,7 @@ def _images(folder: Path) -> list[ImageFile]:
 
 def _read_endonerf(folder: Path, image_size: int | None) -> Capture:
     path = folder / POSES
-    images = _images(folder / IMAGES)
+    images = _images(folder / IMAGES, whole=True)
     names = [image.path.name for image in images]
     rows = _read_rows(path, names, "images", np.eye(3))
     frames = [

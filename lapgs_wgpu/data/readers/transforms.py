@@ -208,6 +208,11 @@ def _read_dnerf(folder: Path, image_size: int | None) -> Capture:
 def _read_split(folder: Path, split: Split, warnings: list[str]) -> list[Frame]:
     """Read the frames of one transforms file. Appends a warning about images that do not exist."""
     path, files = folder / f"transforms_{split}.json", CaptureFiles(folder)
+    if not path.is_file():
+        raise InputError(
+            f"{path} does not exist, which a D-NeRF scene needs; if there is one file alone, name it transforms.json, "
+            "and every eighth image is held out."
+        )
     read = _read_frames(read_json(path), files, "time")
     frames = []
     for index, frame in enumerate(read):
