@@ -67,18 +67,18 @@ def check_plausible(frames: Sequence[Frame]) -> list[str]:
             f"{size_text(lens.size)}, in {len(off)} cameras; unless the images were cut out of larger ones, the "
             "intrinsics are those of another size, or in other units than pixels."
         )
-    highest, told = _highest([frame.image for frame in frames if frame.image.deep], slice(3))
+    highest, told = _highest([frame.image for frame in frames if frame.image.deep])
     if highest < DARK:
         bits = highest.bit_length()
         warnings.append(
             f"images of 16 bits are nearly black: {told}, so they seem to use {8 + bits} bits; multiply them by "
             f"{2 ** (8 - bits)}."
         )
-    highest, told = _highest([frame.image for frame in frames if frame.image.alpha], slice(3, 4))
+    highest, told = _highest([frame.image for frame in frames if frame.image.alpha], "alpha")
     if highest < DARK:
         warnings.append(
-            f"images are nearly transparent: the alpha, {told}, and transparent pixels count as background; save the "
-            "images without alpha."
+            f"images are nearly transparent: {told}, and transparent pixels count as background; save the images "
+            "without alpha."
         )
     return warnings + _black_cameras(frames)
 
@@ -87,12 +87,13 @@ def _is_off_center(lens: Lens) -> bool:
     return max(abs(lens.cx / lens.width - 0.5), abs(lens.cy / lens.height - 0.5)) > OFF_CENTER
 
 
-def _highest(images: Sequence[ImageFile], channels: slice, most: int = LOOKED_AT) -> tuple[int, str]:
-    """The highest level in some channels of some of the images, 255 where there are none, and a text that says it."""
+def _highest(images: Sequence[ImageFile], of: str = "level", most: int = LOOKED_AT) -> tuple[int, str]:
+    """The highest level (or alpha) in some of the images, 255 where there are none, and a text that says it."""
     looked_at = evenly(images, most)
+    channels = slice(3) if of == "level" else slice(3, 4)
     highest = max((int(decode(image.path)[..., channels].max()) for image in looked_at), default=255)
     such = f"in {len(looked_at)} of {len(images)}, such as {looked_at[0]}, " if looked_at else ""
-    return highest, f"{such}no level is above {highest} of 255"
+    return highest, f"{such}no {of} is above {highest} of 255"
 
 
 def _black_cameras(frames: Sequence[Frame]) -> list[str]:
@@ -100,7 +101,7 @@ def _black_cameras(frames: Sequence[Frame]) -> list[str]:
     for frame in frames:
         if frame.name.camera and not frame.image.deep:
             films.setdefault(frame.name.camera, []).append(frame.image)
-    found = {name: _highest(images, slice(3), BLACK_AT) for name, images in films.items() if len(images) > 1}
+    found = {name: _highest(images, most=BLACK_AT) for name, images in films.items() if len(images) > 1}
     black = {name: told for name, (highest, told) in found.items() if highest < BLACK}
     return [
         f"{len(black)} of {len(found)} cameras are black, such as {name}: {told}: "
