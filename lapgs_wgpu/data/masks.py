@@ -75,9 +75,12 @@ def check_masks(masks: Sequence[Path], size: Size, kind: MaskKind, what: str) ->
     if not masks:
         return []
     checked = evenly(masks, CHECKED)
-    shares = [decode_mask(path, kind).mean() for path in checked]
+    levels = [_levels(path) for path in checked]
+    shares = [_is_set(each, kind).mean() for each in levels]
     told = f"{what} by the masks: in {len(checked)} of {len(masks)} that were looked at, such as {checked[0]},"
-    color = f"pixel is {kind} ({'below' if kind == 'black' else 'at least'} {WHITE} of 255)"
+    lowest, highest = min(each.min() for each in levels), max(each.max() for each in levels)
+    side = "below" if kind == "black" else "at least"
+    color = f"pixel is {kind} ({side} {WHITE}, and their levels are {lowest} to {highest})"
     if max(shares) == 0:
         return [f"nothing {told} no {color}."]
     if min(shares) == 1:
@@ -96,14 +99,21 @@ def read_mask(path: Path, kind: MaskKind, undistortion: Undistortion, stored: Si
 
 
 def decode_mask(path: Path, kind: MaskKind = "white") -> Mask:
-    """The pixels (H, W) that a mask sets, in its alpha if its color is the same everywhere; levels of 0 and 1 mean 0
-    and 255. Raises InputError."""
+    """The pixels (H, W) that a mask sets. Raises InputError."""
+    return _is_set(_levels(path), kind)
+
+
+def _is_set(levels: NDArray[np.uint8], kind: MaskKind) -> Mask:
+    return (levels < WHITE) == (kind == "black")
+
+
+def _levels(path: Path) -> NDArray[np.uint8]:
+    """The levels (H, W) of a mask: of its alpha if its color is the same everywhere; 0 and 1 mean 0 and 255."""
     mask = decode(path)
     level = mask[..., :3].max(axis=2)
     if mask.shape[2] == 4 and level.min() == level.max() and mask[..., 3].min() < 255:
         level = mask[..., 3]
-    threshold = 1 if level.max() == 1 else WHITE
-    return (level < threshold) == (kind == "black")
+    return level * np.uint8(255) if level.max() == 1 else level
 
 
 def as_pixels(mask: Mask) -> Pixels:

@@ -167,8 +167,8 @@ def disorder(names: Sequence[ImageName], times: Sequence[float]) -> list[str]:
             alike.setdefault(span, []).append(camera)
         told = (f"{some(cameras)} from {a:g} to {b:g}" for (a, b), cameras in alike.items())
         warnings.append(
-            f"cameras film at different times: {', '.join(told)}; if some film more images a second, or were started "
-            f"apart, write the times in seconds into {TIMES}."
+            f"cameras film at different times: {', '.join(told)}; if these are no seconds, since some film more images "
+            f"a second or were started apart, write the times in seconds into {TIMES}."
         )
     return warnings
 

@@ -105,7 +105,7 @@ def _black_cameras(frames: Sequence[Frame]) -> list[str]:
     black = {name: told for name, (highest, told) in found.items() if highest < BLACK}
     return [
         f"{len(black)} of {len(found)} cameras are black, such as {name}: {told}: "
-        f"{'leave them out' if len(found) > 1 else 'give brighter images'}."
+        f"{'leave them out' if len(found) > len(black) else 'give brighter images'}."
         for name, told in [*black.items()][:1]
     ]
 
