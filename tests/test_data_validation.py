@@ -16,12 +16,7 @@ from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.images import check_film
 from lapgs_wgpu.data.stamps import ImageName, natural_key
-from lapgs_wgpu.data.timestamps import (
-    disorder,
-    frame_numbers,
-    held_out,
-    in_step,
-)
+from lapgs_wgpu.data.timestamps import disorder, frame_numbers, held_out, in_step
 from lapgs_wgpu.data.validation import check_in_view, check_spacing, check_times, check_views
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
