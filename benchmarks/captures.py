@@ -56,17 +56,16 @@ def megabytes(who: int = resource.RUSAGE_SELF) -> float:
 
 def unpack(folder: Path, films: int) -> None:
     """Unpack so many of the films, which are copies of one; the pictures of the others become links to the first's."""
-    from lapgs_wgpu.data.video_frames import Display, frames_folder, unpacked
+    from lapgs_wgpu.data.video_frames import frames_folder, unpacked
 
     first, *others = sorted(folder.glob("*.mp4"))
     for film in others[: films - 1]:
         unpacked(film, None)
     size = unpacked(first, None)[0].size
-    upright = Display(0, False)
     for film in others[films - 1 :]:
-        copy = frames_folder(film, size, upright)
+        copy = frames_folder(film, size)
         if not copy.is_dir():
-            shutil.copytree(frames_folder(first, size, upright), copy, copy_function=os.link)
+            shutil.copytree(frames_folder(first, size), copy, copy_function=os.link)
 
 
 def train(folder: Path, out: Path, preset: str, cache_gb: float, still: int, moving: int) -> dict[str, float]:

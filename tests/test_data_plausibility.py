@@ -193,6 +193,9 @@ def test_images_that_are_transparent(tmp_path: Path, alpha: int, clear: bool) ->
 def test_format_is_named_whatever_the_file_is_called(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="WebP"):
         load_dataset(capture(tmp_path / "webp", lambda i, p: Image.fromarray(i).save(p, "WEBP"), suffix="jpg"))
+    for word, head in {"HEIC": b"\0\0\0\x18ftypheic", "Git LFS": b"version https://git-lfs", "empty": b""}.items():
+        with pytest.raises(InputError, match=word):
+            load_dataset(capture(tmp_path / word, lambda _, path, head=head: path.write_bytes(head), suffix="jpg"))
 
 
 @pytest.mark.parametrize("share", [0.25, 0.5, 1.0])

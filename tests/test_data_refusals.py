@@ -95,7 +95,7 @@ DNERF: list[Case] = [
     (of_frame("time", NAN), f"{TRAIN} time nan"),
     (of_frame("transform_matrix", [[1]] * 4), f"{TRAIN} transform_matrix"),
     (of_frame("transform_matrix", np.transpose(camera_to_world(1)).tolist()), TRAIN),
-    (other_entry(0, 3, "x"), 'transform_matrix "x"'),
+    (other_entry(0, 3, "x"), "transform_matrix 'x'"),
     (other_entry(0, 3, 10**400), "transform_matrix"),
     (with_axes([2, 2, 2]), "transform_matrix rotation"),
     (with_axes([1, 1, -1]), "transform_matrix left-handed"),
@@ -125,7 +125,7 @@ COLMAP: list[Case] = [
     (text(f"{MODEL}/images.txt", "#\n"), MODEL),
     (text(f"{MODEL}/images.txt", b"\xff\xfe"), "images.txt"),
     (text("times.json", '{"frame_0001.png": 1}'), "times.json frame_0002.png"),
-    (times(frame_0002="one"), 'times.json frame_0002.png "one"'),
+    (times(frame_0002="one"), "times.json frame_0002.png 'one'"),
 ]
 COUNT_OF_POINT = 8 + 8 + 24 + 3 + 8  # where the first point says how many images see it
 

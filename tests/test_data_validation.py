@@ -14,14 +14,10 @@ from PIL import Image, ImageFilter
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.cloud import Cloud
+from lapgs_wgpu.data.images import check_film
 from lapgs_wgpu.data.stamps import ImageName, natural_key
-from lapgs_wgpu.data.timestamps import (
-    disorder,
-    frame_numbers,
-    held_out,
-    in_step,
-)
-from lapgs_wgpu.data.validation import check_film, check_in_view, check_spacing, check_times, check_views
+from lapgs_wgpu.data.timestamps import disorder, frame_numbers, held_out, in_step
+from lapgs_wgpu.data.validation import check_in_view, check_spacing, check_times, check_views
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
@@ -40,7 +36,7 @@ def turned(camera: Camera) -> Camera:
 
 def test_cameras_that_look_away_or_do_not_move() -> None:
     def warnings(taken: list[Camera]) -> list[str]:
-        return check_views(CLOUD, taken, [f"{i}.png" for i in range(len(taken))], Path("points3D.bin"))
+        return check_views(CLOUD, {each: f"{i}.png" for i, each in enumerate(taken)}, Path("points3D.bin"))
 
     taken = cameras(6)
     assert warnings(taken) == []
@@ -133,12 +129,12 @@ def test_cameras_that_look_away_for_a_while(device: Device, tmp_path: Path, caps
 def test_frames_out_of_order() -> None:
     images = [ImageName(f"frame_{i:03d}.jpg", ".") for i in range(10)]
     times = [float(i) for i in range(10)]
-    assert disorder(images, times, numbered=False) == []
+    assert disorder(images, times) == []
     times[4], times[5] = times[5], times[4]
-    (warning,) = disorder(images, times, numbered=False)
+    (warning,) = disorder(images, times)
     assert "frame_004.jpg at 5 to frame_005.jpg at 4" in warning
     images = [ImageName(f"cam{c}/{i + 10 * c:03d}.jpg", f"cam{c}") for c in range(2) for i in range(5)]
-    (warning,) = disorder(images, [float(n) for n in frame_numbers(images)], numbered=True)
+    (warning,) = disorder(images, [float(n) for n in frame_numbers(images)])
     assert "cam0 from 0 to 4" in warning, "no time in common"
 
 

@@ -493,7 +493,7 @@ def test_images_that_show_nothing_are_refused(dataset: Dataset, device: Device) 
     def empty() -> np.ndarray:
         return np.zeros((48, 48, 4), np.uint8)
 
-    views = tuple(dataclasses.replace(view, pixels=empty) for view in dataset.train)
+    views = tuple(dataclasses.replace(view, load=empty) for view in dataset.train)
     with pytest.raises(InputError, match="show nothing but the black background"):
         discover(configure(discovery__steps="4"), dataclasses.replace(dataset, train=views), device)
 

@@ -95,7 +95,7 @@ def test_ignored_pixels_are_marked_and_transparent_ones_count() -> None:
     assert marked[0, 0].tolist() == [255, 255, 255, 255]
     assert marked[0, 1].tolist() == [7, 7, 7, 255]
     assert marked[1, 2].tolist() == [255, 255, 255, 0]
-    opaque = dataclasses.replace(view, pixels=lambda: rgba[..., :3].copy(), ignored=None)
+    opaque = dataclasses.replace(view, load=lambda: rgba[..., :3].copy(), ignored=None)
     assert marked_pixels(opaque, BLACK).shape == (2, 3, 3)
 
 

@@ -66,7 +66,7 @@ def test_what_is_ignored_does_not_change_a_bit(device: Device, dataset: Dataset,
             ignored[8:20, 12:30] = True
             pixels = view.load().copy()
             pixels[ignored] = level
-            views.append(dataclasses.replace(view, pixels=pixels.copy, ignored=ignored.copy))
+            views.append(dataclasses.replace(view, load=pixels.copy, ignored=ignored.copy))
         return dataclasses.replace(dataset, train=tuple(views))
 
     config = configure(schedule__steps="8", schedule__warm_up="2", discovery__steps="8", discovery__size="32")

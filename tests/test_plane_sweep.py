@@ -89,7 +89,7 @@ def test_a_blank_surface_is_filled_in() -> None:
             shown.reshape(-1, 3)[inside] = blank
             return shown
 
-        return dataclasses.replace(view, pixels=image)
+        return dataclasses.replace(view, load=image)
 
     found = still_surface(dataclasses.replace(data, train=tuple(painted(view) for view in data.train)))
     assert found is not None
@@ -124,7 +124,7 @@ def test_what_moves_starts_where_it_is_at_five_times(capsys: pytest.CaptureFixtu
             shown.reshape(-1, 3)[inside] = np.round(255 * TEXTURE[texture[:, 0], texture[:, 1], ::-1])
             return shown
 
-        return dataclasses.replace(view, pixels=image)
+        return dataclasses.replace(view, load=image)
 
     found = still_surface(dataclasses.replace(data, train=tuple(passed(view) for view in data.train)))
     assert found is not None

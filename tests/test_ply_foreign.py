@@ -10,7 +10,7 @@ import pytest
 from helpers.ply_files import assert_same, columns_of, ply_bytes, random_still, read_ply
 from helpers.scene_files import moving_scene
 
-from lapgs_wgpu.data.cloud import read_points
+from lapgs_wgpu.data.cloud import read_cloud, read_points
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.checkpoint import read_checkpoint
@@ -180,6 +180,17 @@ def test_a_cloud_whose_colors_are_not_known(tmp_path: Path, capsys: pytest.Captu
     (tmp_path / "a.ply").write_bytes(ply_bytes(columns))
     assert read_points(tmp_path / "a.ply")[1] is None
     assert "intensity" in capsys.readouterr().err
+
+
+def test_few_points_of_a_cloud_that_are_nan_are_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    points = np.random.default_rng(0).normal(size=(300, 3))
+    points[[3, 7, 9], [0, 1, 2]] = np.nan, np.inf, -np.inf
+    np.save(tmp_path / "points.npy", points)
+    assert len(read_cloud(tmp_path / "points.npy").points) == 297
+    assert "3 of 300 points, which are left out" in capsys.readouterr().err
+    np.save(tmp_path / "points.npy", points[:299])
+    with pytest.raises(InputError, match="3 of 299 points"):
+        read_cloud(tmp_path / "points.npy")
 
 
 def test_half_precision(tmp_path: Path) -> None:

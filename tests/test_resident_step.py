@@ -330,9 +330,7 @@ def spoil(passes: ResidentPasses, at: int) -> None:
 def smaller(view: View) -> View:
     """The upper left part of a view."""
     camera = dataclasses.replace(view.camera, width=view.camera.width - 5, height=view.camera.height - 9)
-    return dataclasses.replace(
-        view, camera=camera, pixels=lambda: view.pixels()[: camera.height, : camera.width].copy()
-    )
+    return dataclasses.replace(view, camera=camera, load=lambda: view.load()[: camera.height, : camera.width].copy())
 
 
 def steps(trainer: Trainer, count: int) -> None:

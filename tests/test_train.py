@@ -146,7 +146,7 @@ def test_the_training_never_sees_the_test_views(
     def stop(*_: object) -> None:
         raise SavedError
 
-    blind = tuple(dataclasses.replace(view, pixels=refuse, time=0.5) for view in dataset.test[:1])
+    blind = tuple(dataclasses.replace(view, load=refuse, time=0.5) for view in dataset.test[:1])
     monkeypatch.setattr(run_module, "evaluate_run", stop)
     with pytest.raises(SavedError):
         train(configure(), dataclasses.replace(dataset, test=blind), tmp_path / "run", device=device)

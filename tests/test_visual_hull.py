@@ -46,7 +46,7 @@ def test_a_ball_is_found_and_followed() -> None:
     dataset = rig()
     assert camera_layout(dataset) == "static cameras all around"
     assert camera_layout(rig(circle=False)) == "static cameras"
-    dark = [replace(view, pixels=lambda: np.zeros((60, 80, 3), np.uint8)) for view in dataset.train[:5]]
+    dark = [replace(view, load=lambda: np.zeros((60, 80, 3), np.uint8)) for view in dataset.train[:5]]
     clouds = hull_points(replace(dataset, train=(*dark, *dataset.train[5:])), HALF)
     for time, cloud in zip(TIMES, clouds.clouds, strict=True):
         assert np.linalg.norm(cloud.positions - center(time), axis=1).max() < 1.5 * RADIUS

@@ -5,19 +5,34 @@ from __future__ import annotations
 import os
 import re
 import unicodedata
+from functools import cached_property
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from urllib.parse import unquote
 
 from lapgs_wgpu.data.images import SUFFIXES, ImageFile, check_image
-from lapgs_wgpu.data.json_fields import Fields, kind
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.data.json_fields import Fields
+from lapgs_wgpu.data.stamps import natural_key
+from lapgs_wgpu.errors import InputError, shown
+from lapgs_wgpu.io.listing import is_desktop_file
 
 MOST_ABSENT = 0.2  # share of the images of a capture that may be absent: whoever deletes blurred ones deletes fewer
-_SMALLER = re.compile(r"(images)_\d+")  # folders of smaller images, as other programs write them beside images/
+_SMALLER = re.compile(r"(.*/)?images(_\d+)?/")  # folders of smaller images, as other programs write them
+
+
+def files_below(folder: Path) -> list[str]:
+    """Return the paths of all files below a folder but the desktop's, relative to it, with slashes, in natural order.
+    Folders may be links; each is entered once."""
+    found: list[str] = []
+    entered: set[str] = set()
+    for parent, folders, names in os.walk(folder, followlinks=True):
+        entered.add(os.path.realpath(parent))
+        folders[:] = [name for name in folders if os.path.realpath(os.path.join(parent, name)) not in entered]
+        found += [Path(parent, name).relative_to(folder).as_posix() for name in names if not is_desktop_file(name)]
+    return sorted(found, key=natural_key)
 
 
 class CaptureFiles:
-    """The files below a folder, each of whose folders is read once. `find` says how far names may differ from theirs.
+    """The files below a folder. `find` says how far names may differ from theirs.
 
     absent: a sentence about each named image that does not exist.
     """
@@ -25,42 +40,39 @@ class CaptureFiles:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.absent: list[str] = []
-        self._entries: dict[Path, dict[str, str]] = {}
 
     def find(self, name: str) -> str | None:
         """Return the path of an existing file relative to the folder, with slashes; None if there is none.
 
         The name may differ from the file's in slashes, number of blanks (also %20), Unicode form, letter case, .jpeg
-        for .jpg, and images_4 for images. Of one that leads out of the folder, as it was written elsewhere, or begins
-        with the folder's own name, the end that is a file in the folder counts. The file whose name is the same goes
-        before others.
+        for .jpg, and, where its folder does not exist, images_4 for images. Of one that leads out of the folder, as it
+        was written elsewhere, or begins with the folder's own name, the end that is a file in the folder counts. The
+        file whose name is the same goes before others.
         """
         path = os.path.relpath(self.folder / name, self.folder)
         if os.path.isfile(self.folder / name) and not path.startswith(".."):  # Path.is_file raises for long names
             return path.replace(os.sep, "/")
-        parts = [part for part in name.replace("\\", "/").split("/") if part not in ("", ".")]
-        ends = [i for i, part in enumerate(parts[:-1], start=1) if _folded(part) == _folded(self.folder.name)][-1:]
+        parts = [part for part in _folded(name).split("/") if part not in ("", ".")]
+        starts = [0, *[i for i, part in enumerate(parts[:-1], start=1) if part == _folded(self.folder.name)][-1:]]
         if _leads_out(name):
-            ends += range(1, len(parts))
-        found = next((found for start in (0, *ends) if (found := self._walk(parts[start:]))), None)
-        return self.find(unquote(name)) if found is None and unquote(name) != name else found
+            starts += range(1, len(parts))
+        for key in ("/".join(parts[start:]) for start in starts):
+            if found := self._by_name.get(key):
+                return found
+            images = _SMALLER.match(key)
+            if images and not os.path.isdir(self.folder / images[0]) and (found := self._smaller.get(_in_images(key))):
+                return found
+        return self.find(unquote(name)) if unquote(name) != name else None
 
-    def _walk(self, parts: list[str]) -> str | None:
-        at = self.folder
-        if ".." in parts:
-            return None
-        for part in parts:
-            if at not in self._entries:
-                names = sorted(os.listdir(at), reverse=True) if os.path.isdir(at) else []
-                self._entries[at] = {_folded(name): name for name in names}
-            entries = self._entries[at]
-            found = part if os.path.exists(at / part) else entries.get(_folded(part))
-            if found is None and (images := _SMALLER.sub(r"\1", _folded(part))) == "images":
-                found = next((entries[key] for key in sorted(entries) if _SMALLER.sub(r"\1", key) == images), None)
-            if found is None:
-                return None
-            at = at / found
-        return at.relative_to(self.folder).as_posix() if os.path.isfile(at) else None
+    @cached_property
+    def _by_name(self) -> dict[str, str]:
+        """The files by their folded names."""
+        return {_folded(path): path for path in reversed(files_below(self.folder))}
+
+    @cached_property
+    def _smaller(self) -> dict[str, str]:
+        """The same, with images for images_4."""
+        return {_in_images(name): path for name, path in self._by_name.items()}
 
     def find_image(self, name: str, named: str) -> str | None:
         """As `find`, of an image, whose name may lack the suffix. If there is none, a sentence goes to `absent`.
@@ -108,10 +120,10 @@ class CaptureFiles:
         """A path whose file, if there is one, lies below the folder; symbolic links may lead out. Raises InputError."""
         name = entry.required(field)
         if not isinstance(name, str) or not name:
-            raise InputError(f"{entry.where}: {field} must be the path of a file, got {kind(name)}.")
+            raise InputError(f"{entry.where}: {field} must be the path of a file, got {shown(name)}.")
         if _leads_out(name) and self.find(name) is None:
             raise InputError(
-                f"{entry.where}: {field} {kind(name)} leads out of the scene's folder, which holds no file of this "
+                f"{entry.where}: {field} {shown(name)} leads out of the scene's folder, which holds no file of this "
                 "name; put the file, or a link to it, into the folder, and name that."
             )
         return name
@@ -125,7 +137,12 @@ def _leads_out(name: str) -> bool:
     )
 
 
+def _in_images(name: str) -> str:
+    return _SMALLER.sub(r"\1images/", name)
+
+
 def _folded(name: str) -> str:
-    """The form in which names of one file agree."""
-    folded = " ".join(unicodedata.normalize("NFC", name).casefold().split())
+    """The form in which names of one file agree, with slashes."""
+    name = unicodedata.normalize("NFC", name).casefold().replace("\\", "/")
+    folded = "/".join(" ".join(part.split()) for part in name.split("/"))
     return folded.removesuffix(".jpeg") + ".jpg" if folded.endswith(".jpeg") else folded

@@ -1,4 +1,4 @@
-"""Some of many, evenly chosen."""
+"""Some of many: evenly chosen items, the first names of a list."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 T = TypeVar("T")
+NAMED = 5  # names in a warning
 
 
 def evenly(items: Sequence[T], most: int) -> list[T]:
@@ -19,3 +20,9 @@ def evenly(items: Sequence[T], most: int) -> list[T]:
 def evenly_indices(count: int, most: int) -> NDArray[np.int64]:
     """Ascending indices of at most `most` of `count` items, evenly spaced; the first and the last are among them."""
     return np.linspace(0, count - 1, min(count, most)).round().astype(np.int64)
+
+
+def some(names: Sequence[str]) -> str:
+    """The first of the names of a warning, and how many more there are."""
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(names[:NAMED]) + more

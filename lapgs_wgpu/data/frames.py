@@ -35,7 +35,7 @@ class Frame:
     name: file name and camera, for rules on own footage.
     states_size: whether the files state the size or the center of the lens; else they are those of the image.
     time: in any unit; None if the files state none. Either all frames of a capture have a time, or none.
-    split: None to apply the rule for own footage (`split.held_out`), for all frames of a capture or for none.
+    split: None to apply the rule for own footage (`timestamps.held_out`), for all frames of a capture or for none.
     label: suffix of the view's name; None to number the views.
     depths: nearest and furthest depth, the capture's units.
     mask: image, of any size, of what the training leaves out, in the color that mask_kind says.

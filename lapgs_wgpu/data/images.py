@@ -7,6 +7,7 @@ without decoding the image, verify checksums, restrict the formats, decode a JPE
 from __future__ import annotations
 
 import math
+import re
 import struct
 import zlib
 from collections.abc import Iterator, Sequence
@@ -21,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from lapgs_wgpu.data.evenly import some
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.ply_elements import LFS_POINTER
 
@@ -34,11 +36,11 @@ _ERRORS = (  # what Pillow raises; the last five for damage that it takes for va
     IndexError, KeyError, TypeError, struct.error, zlib.error,
 )  # fmt: skip
 _MODES = {"1", "L", "LA", "P", "PA", "RGB", "RGBA", "I;16", "I"}  # the last two: gray PNG of 16 bits
-_SIGNATURES = (  # bytes, their place, and the format
-    (b"WEBP", 8, "WebP"), (b"ftypheic", 4, "HEIC"), (b"ftypmif1", 4, "HEIC"), (b"ftypavif", 4, "AVIF"),
-    (b"II*\0", 0, "TIFF"), (b"MM\0*", 0, "TIFF"), (b"GIF8", 0, "GIF"), (b"BM", 0, "BMP"),
-    (b"\x76\x2f\x31\x01", 0, "OpenEXR"), (b"\xff\x0a", 0, "JPEG XL"),
-)  # fmt: skip
+_OTHERS = re.compile(  # first bytes of other formats
+    rb"(?P<WebP>.{8}WEBP)|(?P<HEIC>.{4}ftyp(hei|mif1|msf1))|(?P<AVIF>.{4}ftypavi)|(?P<TIFF>II\*\0|MM\0\*)|(?P<GIF>GIF8)"
+    rb"|(?P<BMP>BM)|(?P<OpenEXR>\x76\x2f\x31\x01)|(?P<JPEG_XL>\xff\x0a|.{4}JXL )",
+    re.DOTALL,
+)
 _ORIENTATION = 0x0112  # EXIF's tag
 SIDEWAYS = 5  # orientations from this one on exchange width and height
 
@@ -121,7 +123,8 @@ def check_image(path: Path, *, whole: bool = True) -> ImageFile:
 
 
 def _has_alpha(file: Image.Image) -> bool:
-    return "A" in file.getbands() or "transparency" in file.info
+    """Whether `decode` returns opacities."""
+    return not file.mode.startswith("I") and ("A" in file.getbands() or "transparency" in file.info)
 
 
 def _content(path: Path) -> str:
@@ -132,9 +135,8 @@ def _content(path: Path) -> str:
         return "is empty (0 bytes); copy or render it again."
     if head.startswith(LFS_POINTER):
         return "is a pointer of Git LFS in place of the image; fetch it by git lfs pull."
-    for start, at, name in _SIGNATURES:
-        if head[at:].startswith(start):
-            return f"holds an image in the format {name}, whatever its name; convert it to PNG or JPEG."
+    if other := _OTHERS.match(head):
+        return f"holds an image in the format {other.lastgroup}, whatever its name; convert it to PNG or JPEG."
     return "is not a readable image (neither PNG nor JPEG); copy or render it again."
 
 
@@ -192,14 +194,24 @@ def repeats(gray: NDArray[np.float32], before: NDArray[np.float32]) -> bool:
     return gray.shape == before.shape and bool(np.abs(gray - before).max() <= EQUAL)
 
 
-def blurred_and_repeated(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
-    """The images of one camera, in the order of time, that are blurred, and those that repeat the one before. Raises
-    InputError."""
+def check_film(images: Sequence[Path]) -> list[str]:
+    """Warn about images of one camera, in the order of time, that are blurred or repeated. Raises InputError."""
+    if len(images) < 3:
+        return []
     with ThreadPoolExecutor(4, thread_name_prefix="thumbnails") as pool:
-        gray = list(pool.map(gray_thumbnail, paths))
+        gray = list(pool.map(gray_thumbnail, images))
     soft = blurred(np.array([sharpness(each) for each in gray]))
-    repeated = [path for path, (before, now) in zip(paths[1:], pairwise(gray), strict=True) if repeats(now, before)]
-    return [path for path, bad in zip(paths, soft, strict=True) if bad], repeated
+    blurry = [path.name for path, bad in zip(images, soft, strict=True) if bad]
+    same = [path.name for path, (before, now) in zip(images[1:], pairwise(gray), strict=True) if repeats(now, before)]
+    found = (
+        ("blurred", blurry, f"have less than {BLURRED:g} of their neighbours' sharpness"),
+        ("repeated", same, f"differ by at most {EQUAL} of 255 levels from the one before: motion stands still"),
+    )
+    return [
+        f"{word} images: {some(names)} ({len(names)} of {len(images)}) {reason}; leave them out, and what names them."
+        for word, names, reason in found
+        if names
+    ]
 
 
 @contextmanager
@@ -212,17 +224,12 @@ def _decoding(path: Path) -> Iterator[None]:
 
 def encode_png(image: Pixels, *, level: int = 6) -> bytes:
     """Encode an image (H, W) gray, (H, W, 3) RGB or (H, W, 4) RGBA as PNG. level: of the compression, 0 to 9."""
-    return _encoded(image, ".png", compress_level=level)
+    return iio.imwrite("<bytes>", image, extension=".png", plugin="pillow", is_batch=False, compress_level=level) or b""
 
 
 def encode_jpeg(image: Pixels) -> bytes:
     """Encode an image (H, W, 3) RGB as JPEG of quality 80, for a page."""
-    return _encoded(image, ".jpg", quality=80)
-
-
-def _encoded(image: Pixels, extension: str, **options: Any) -> bytes:
-    options["is_batch"] = False
-    return iio.imwrite("<bytes>", image, extension=extension, plugin="pillow", **options) or b""
+    return iio.imwrite("<bytes>", image, extension=".jpg", plugin="pillow", is_batch=False, quality=80) or b""
 
 
 def resize(image: Pixels, size: Size, resampling: Image.Resampling) -> Pixels:

@@ -59,13 +59,11 @@ def limit_optical_depth(
 
     points: (n, 3), world units. scales: (n,), world units. opacity: of each Gaussian. Returns (n,) scales.
     """
-    depths = [_optical_depth(points, scales, opacity, camera) for camera in evenly(cameras, CAMERA_SAMPLES)]
-    return (scales * min(1.0, (MAX_OPTICAL_DEPTH / max(float(np.median(depths)), 1e-9)) ** 0.5)).astype(np.float32)
-
-
-def _optical_depth(points: NDArray[np.floating], scales: NDArray[np.floating], opacity: float, camera: Camera) -> float:
-    """Optical depth of all Gaussians in a camera's view, mean over the pixels."""
-    depths, inside = in_view(points, camera)
-    radii = scales[inside] / depths[inside]
-    area = 2 * np.pi * radii**2 * camera.K[0, 0] * camera.K[1, 1] / (camera.width * camera.height)
-    return float((opacity * np.minimum(area, 1.0)).sum())
+    optical_depths = []
+    for camera in evenly(cameras, CAMERA_SAMPLES):
+        depths, inside = in_view(points, camera)
+        radii = scales[inside] / depths[inside]
+        area = 2 * np.pi * radii**2 * camera.K[0, 0] * camera.K[1, 1] / (camera.width * camera.height)
+        optical_depths.append(float((opacity * np.minimum(area, 1.0)).sum()))
+    factor = min(1.0, (MAX_OPTICAL_DEPTH / max(float(np.median(optical_depths)), 1e-9)) ** 0.5)
+    return (scales * factor).astype(np.float32)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.errors import InputError, shown
 from lapgs_wgpu.io import safe_json_toml
 
 LARGEST_ENTRY = 1e9  # of a pose: matrix products of larger entries lose all digits
@@ -46,14 +45,14 @@ class Fields:
 
     def vector(self, name: str, length: int) -> NDArray[np.float64]:
         """Return (length,) numbers of at most LARGEST_ENTRY. Raises InputError."""
-        return vector(self.required(name), length, name, self.where)
+        return matrix(self.required(name), (length,), name, self.where)
 
     def entries(self, name: str, count: int | None = None) -> list[Any]:
         """Return a list of at least one entry, or of `count`. Raises InputError."""
         value = self.required(name)
         if not isinstance(value, list) or not value or (count is not None and len(value) != count):
             needed = "at least one entry" if count is None else f"{count} entries"
-            raise InputError(f"{self.where}: {name} must be a list of {needed}, got {kind(value)}.")
+            raise InputError(f"{self.where}: {name} must be a list of {needed}, got {shown(value)}.")
         return value
 
     def objects(self, name: str, what: str) -> list[Fields]:
@@ -64,7 +63,7 @@ class Fields:
 def as_fields(value: Any, where: str) -> Fields:
     """Check that a JSON value is an object. Raises InputError."""
     if not isinstance(value, dict):
-        raise InputError(f"{where} must be a JSON object, got {kind(value)}.")
+        raise InputError(f"{where} must be a JSON object, got {shown(value)}.")
     return Fields(value, where)
 
 
@@ -85,7 +84,7 @@ def number(
             raise ValueError
         converted = float(value)
     except ValueError:
-        raise InputError(f"{where}: {name} must be a number, got {kind(value)}.") from None
+        raise InputError(f"{where}: {name} must be a number, got {shown(value)}.") from None
     except OverflowError:  # an integer of more than 308 digits
         converted = math.inf
     if not least <= converted <= most:  # true for NaN, too
@@ -93,27 +92,12 @@ def number(
     return converted
 
 
-def vector(value: Any, length: int, name: str, where: str | Path) -> NDArray[np.float64]:
-    """Convert a JSON list to (length,) numbers of at most LARGEST_ENTRY. Raises InputError."""
-    if not isinstance(value, list) or len(value) != length:
-        raise InputError(f"{where}: {name} must be a list of {length} numbers, got {kind(value)}.")
+def matrix(value: Any, shape: tuple[int, ...], name: str, where: str | Path) -> NDArray[np.float64]:
+    """Convert a JSON list, or lists in lists, to numbers of this shape, of at most LARGEST_ENTRY. Raises InputError."""
+    if not isinstance(value, list) or len(value) != shape[0]:
+        needed = " rows of ".join(map(str, shape))
+        raise InputError(f"{where}: {name} must be {needed} numbers, got {shown(value)}.")
+    if len(shape) > 1:
+        return np.stack([matrix(row, shape[1:], name, where) for row in value])
     bounds = -LARGEST_ENTRY, LARGEST_ENTRY
     return np.array([number(entry, f"each entry of {name}", where, *bounds) for entry in value])
-
-
-def matrix(value: Any, shape: tuple[int, int], name: str, where: str | Path) -> NDArray[np.float64]:
-    """Convert a JSON list of rows to numbers (rows, columns) of at most LARGEST_ENTRY. Raises InputError."""
-    rows, columns = shape
-    if not isinstance(value, list) or len(value) != rows:
-        raise InputError(f"{where}: {name} must be {rows} rows of {columns} numbers, got {kind(value)}.")
-    return np.stack([vector(row, columns, name, where) for row in value])
-
-
-def kind(value: Any) -> str:
-    """Describe a JSON value in JSON's terms, short enough for an error."""
-    if isinstance(value, list):
-        return f"a list of {len(value)}"
-    if isinstance(value, dict):
-        return "an object"
-    text = json.dumps(value)
-    return text if len(text) <= 40 else text[:37] + "..."

@@ -9,10 +9,10 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path, PurePath
+from pathlib import Path
 
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
-from lapgs_wgpu.data.images import SUFFIXES, Pixels, Size, shrink, shrunk_size
+from lapgs_wgpu.data.images import SUFFIXES, Pixels, Size, check_film, shrink, shrunk_size
 from lapgs_wgpu.data.lens import Lens, Undistortion
 from lapgs_wgpu.data.masks import MOSTLY, Mask, MaskKind, check_masks, find_masks, read_mask
 from lapgs_wgpu.data.normalize import Normalization
@@ -20,7 +20,7 @@ from lapgs_wgpu.data.placement import mover_cube, place
 from lapgs_wgpu.data.readers import apps, colmap, hypernerf, panoptic, poses_bounds, transforms
 from lapgs_wgpu.data.stamps import natural_key
 from lapgs_wgpu.data.timestamps import as_one_camera, by_camera, disorder, held_out, in_step, read_times
-from lapgs_wgpu.data.validation import check_cloud, check_film, check_frames, check_plausible, check_views, upright
+from lapgs_wgpu.data.validation import check_cloud, check_frames, check_plausible, check_views, upright
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
@@ -65,12 +65,13 @@ def load_dataset(
     frames = list(capture.frames)
     if not undistort:
         frames = [dataclasses.replace(frame, lens=frame.lens.idealized) for frame in frames]
-    frames, warnings = upright(frames)
-    warnings = [*capture.warnings, *warnings, *check_plausible(frames)]
+    warnings = list(capture.warnings)
+    frames = upright(frames, warnings)
+    warnings += check_plausible(frames)
     frames, time_source = _timed(folder, dataclasses.replace(capture, frames=frames), warnings)
     check_frames(frames)
-    frames = _masked(frames, None if masks is None else Path(masks), None if movers is None else folder / movers)
-    warnings += _check_masks(frames)
+    own_masks, own_movers = None if masks is None else Path(masks), None if movers is None else folder / movers
+    frames = _masked(frames, own_masks, own_movers, warnings)
 
     capture = dataclasses.replace(capture, frames=frames)
     cameras, undistortions = _cameras(capture, shrunk_size(frames[0].image.size, image_size))
@@ -78,23 +79,21 @@ def load_dataset(
     training_cameras = list(dict.fromkeys(camera for camera, _ in training))
     if capture.cloud is not None:
         if capture.own_footage:
-            warnings += check_views(capture.cloud, cameras, [frame.name.file for frame in frames], capture.source)
-        cloud = check_cloud(capture.cloud, training_cameras, capture.source, warnings)
-        capture = dataclasses.replace(capture, cloud=cloud)
+            named = {camera: frame.name.file for camera, frame in zip(cameras, frames, strict=True)}
+            warnings += check_views(capture.cloud, named, capture.source)
+        seen_cloud = check_cloud(capture.cloud, training_cameras, capture.source, warnings)
+        capture = dataclasses.replace(capture, cloud=seen_cloud)
     moving = None
     if movers is not None and capture.cloud is not None:
         by_time = sorted(training, key=lambda pair: pair[1].time or 0.0)
         seen = [(c, _view(frame, 0, c, undistortions[frame.lens]).moving) for c, frame in by_time]
         moving = mover_cube(capture.cloud, [(camera, mask) for camera, mask in seen if mask is not None])
-    placement = place(capture, training_cameras, moving)
-    warnings += placement.warnings
-
-    fit = placement.normalization
+    fit, cloud, depths = place(capture, training_cameras, moving, warnings)
     whole = fit if fit is None or capture.moved is None else capture.moved.then(fit)
     placed = {camera: camera if fit is None else fit.camera(camera) for camera in set(cameras)}
     # Without a cloud, what stands just before one camera would explain its images alone, and block those beside it.
-    if placement.depths is not None and placement.cloud is None:
-        near = NEAR_SHARE * placement.depths[0]
+    if depths is not None and cloud is None:
+        near = NEAR_SHARE * depths[0]
         placed = {camera: dataclasses.replace(seen, near=near) for camera, seen in placed.items()}
     order = _by_film(frames, warnings) if capture.own_footage else range(len(frames))
 
@@ -110,8 +109,8 @@ def load_dataset(
         views("train"),
         views("test"),
         val=views("val"),
-        cloud=placement.cloud,
-        depths=placement.depths,
+        cloud=cloud,
+        depths=depths,
         normalization=whole,
         scale=1.0 if fit is None else fit.scale,
         warnings=tuple(warnings),
@@ -125,20 +124,15 @@ def _summary(
     layout: str, capture: Capture, cameras: Sequence[Camera], time_source: str, moved: Normalization | None
 ) -> str:
     """Say how a capture was understood: layout, cameras, times and their source, what is held out, its scale."""
-    films = by_camera([frame.name for frame in capture.frames])
-    folders = len({PurePath(frame.name.file).parent for frame in capture.frames})
-    held = [frame.name.camera for frame in capture.frames if frame.split != "train"]
-    places = len(set(cameras))
-    still = len(cameras) >= 2 * places
-    number = places if still else len(films)
+    frames, places = capture.frames, len(set(cameras))
+    still = len(frames) >= 2 * places
+    number = places if still else len({frame.name.camera for frame in frames})
     told = f"{number} {'still' if still else 'moving'} camera{'s' * (number > 1)}"
-    if not still and capture.own_footage and len(films) > 1:
-        told += " that film at the same time"
-    elif not still and capture.own_footage and folders > 1:
-        told += f" in {folders} folders, one after the other"
-    whole = len(films) > 1 and len(set(held)) == 1 and len(films[held[0]]) == len(held)
-    out = f"{held[0]} is" if whole else f"{len(held)} of {len(cameras)} images are"
-    times = len({frame.time for frame in capture.frames})
+    times = len({frame.time for frame in frames})
+    held = [frame.name.camera for frame in frames if frame.split != "train"]
+    trained = {frame.name.camera for frame in frames if frame.split == "train"}
+    one = len({*held}) == 1 and held[0] not in trained
+    out = f"{held[0]} is" if one else f"{len(held)} of {len(frames)} images are"
     scale = "coordinates are kept" if moved is None else f"1 unit of the files becomes {moved.scale:.4g}"
     left_out = f"; {capture.left_out} left out" if capture.left_out else ""
     return f"{layout}, {told}, {times} times from {time_source}; {out} held out; {scale}{left_out}"
@@ -180,7 +174,7 @@ def _timed(folder: Path, capture: Capture, warnings: list[str]) -> tuple[list[Fr
         times, source = read_times(names, folder)
     if capture.own_footage:
         names = as_one_camera(names, times, [frame.place for frame in capture.frames])
-        warnings += disorder(names, times, numbered=source.startswith("the frame numbers"))
+        warnings += disorder(names, times)
         times = in_step(names, times)
     first, last = capture.time_range or (min(times), max(times))
     times = [(time - first) / (last - first) if last > first else 0.0 for time in times]
@@ -194,9 +188,9 @@ def _timed(folder: Path, capture: Capture, warnings: list[str]) -> tuple[list[Fr
     return [dataclasses.replace(f, name=name, time=time, split=split) for f, name, time, split in found], source
 
 
-def _masked(frames: Sequence[Frame], masks: Path | None, movers: Path | None) -> list[Frame]:
+def _masked(frames: Sequence[Frame], masks: Path | None, movers: Path | None, warnings: list[str]) -> list[Frame]:
     """Give training frames the masks in the user's folder, in place of those that the capture names, and all frames
-    those of what moves."""
+    those of what moves. Appends warnings. Raises InputError."""
     if masks is not None:
         names = [frame.name.file for frame in frames if frame.split == "train"]
         found = find_masks(masks, names, "each training image, named as the image")
@@ -204,14 +198,11 @@ def _masked(frames: Sequence[Frame], masks: Path | None, movers: Path | None) ->
     if movers is not None:
         found = find_masks(movers, [frame.name.file for frame in frames], "each image, white where it moves")
         frames = [dataclasses.replace(frame, moving=found[frame.name.file]) for frame in frames]
-    return list(frames)
-
-
-def _check_masks(frames: Sequence[Frame]) -> list[str]:
     size, kind = frames[0].image.size, frames[0].mask_kind
-    ignored = {frame.name.file: frame.mask for frame in frames if frame.split == "train" and frame.mask is not None}
-    moving = {frame.name.file: frame.moving for frame in frames if frame.moving is not None}
-    return check_masks(ignored, size, kind) + check_masks(moving, size, "white", movers=True)
+    ignored = [frame.mask for frame in frames if frame.split == "train" and frame.mask is not None]
+    moving = [frame.moving for frame in frames if frame.moving is not None]
+    warnings += check_masks(ignored, size, kind, "is left out") + check_masks(moving, size, "white", "moves")
+    return list(frames)
 
 
 def _cameras(capture: Capture, size: Size) -> tuple[list[Camera], dict[Lens, Undistortion]]:
@@ -253,7 +244,7 @@ def _view(frame: Frame, number: int, camera: Camera, undistortion: Undistortion)
         camera=camera,
         time=frame.time,
         source=str(frame.image),
-        pixels=pixels,
+        load=pixels,
         ignored=mask(frame.mask, frame.mask_kind) if frame.split == "train" else None,
         moving=mask(frame.moving, "white", MOSTLY),
     )

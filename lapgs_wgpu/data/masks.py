@@ -6,7 +6,7 @@ capture names itself (nerfstudio's `mask_path`); or what moves, white.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
@@ -64,30 +64,28 @@ def check_mask_size(path: Path, size: Size) -> None:
         )
 
 
-def check_masks(masks: Mapping[str, Path], size: Size, kind: MaskKind, *, movers: bool = False) -> list[str]:
+def check_masks(masks: Sequence[Path], size: Size, kind: MaskKind, what: str) -> list[str]:
     """Check the proportions of masks for images of (width, height) `size`, and decode some of them.
 
-    masks: by image. movers: whether they say what moves, white. Returns a warning if these take out nothing. Raises
-    InputError for other proportions, or if they take out everything.
+    what: they say of the pixels that they set, such as "moves". Returns a warning if they set no pixel of those that
+    are decoded. Raises InputError for other proportions, or if they set all of these.
     """
-    for path in masks.values():
+    for path in masks:
         check_mask_size(path, size)
-    checked = evenly(list(masks.values()), CHECKED)
-    levels = [_levels(decode(path)) for path in checked]
-    shares = [_set(level, kind).mean() for level in levels]
-    if not shares or (max(shares) > 0 and min(shares) < 1):
+    if not masks:
         return []
-    color = f"{'black (a level below' if kind == 'black' else 'white (a level of at least'} {WHITE} of 255)"
-    looked_at = (
-        f"in {len(levels)} of {len(masks)} that were looked at, such as {checked[0]}, {{}} pixel is {color}; their "
-        f"levels are {min(level.min() for level in levels)} to {max(level.max() for level in levels)}"
-    )
-    what = "moves by the masks" if movers else "is left out by the masks"
+    checked = evenly(masks, CHECKED)
+    levels = [_levels(path) for path in checked]
+    shares = [_is_set(each, kind).mean() for each in levels]
+    told = f"{what} by the masks: in {len(checked)} of {len(masks)} that were looked at, such as {checked[0]},"
+    lowest, highest = min(each.min() for each in levels), max(each.max() for each in levels)
+    side = "below" if kind == "black" else "at least"
+    color = f"pixel is {kind} ({side} {WHITE}, and their levels are {lowest} to {highest})"
     if max(shares) == 0:
-        return [f"nothing {what}: {looked_at.format('no')}."]
-    raise InputError(
-        f"everything {what}: {looked_at.format('every')}: write them as 0 and 255, invert them, or leave them out."
-    )
+        return [f"nothing {told} no {color}."]
+    if min(shares) == 1:
+        raise InputError(f"everything {told} every {color}; write them as 0 and 255, invert them, or leave them out.")
+    return []
 
 
 def read_mask(path: Path, kind: MaskKind, undistortion: Undistortion, stored: Size, size: Size, above: int = 0) -> Mask:
@@ -102,19 +100,19 @@ def read_mask(path: Path, kind: MaskKind, undistortion: Undistortion, stored: Si
 
 def decode_mask(path: Path, kind: MaskKind = "white") -> Mask:
     """The pixels (H, W) that a mask sets. Raises InputError."""
-    return _set(_levels(decode(path)), kind)
+    return _is_set(_levels(path), kind)
 
 
-def _set(levels: NDArray[np.uint8], kind: MaskKind) -> Mask:
-    """The pixels (H, W) that a mask of these levels sets."""
+def _is_set(levels: NDArray[np.uint8], kind: MaskKind) -> Mask:
     return (levels < WHITE) == (kind == "black")
 
 
-def _levels(mask: Pixels) -> NDArray[np.uint8]:
+def _levels(path: Path) -> NDArray[np.uint8]:
     """The levels (H, W) of a mask: of its alpha if its color is the same everywhere; 0 and 1 mean 0 and 255."""
+    mask = decode(path)
     level = mask[..., :3].max(axis=2)
-    if mask.shape[2] == 4 and level.min() == level.max():
-        level = mask[..., 3] if mask[..., 3].min() < 255 else level
+    if mask.shape[2] == 4 and level.min() == level.max() and mask[..., 3].min() < 255:
+        level = mask[..., 3]
     return level * np.uint8(255) if level.max() == 1 else level
 
 

@@ -68,11 +68,6 @@ class Cube(NamedTuple):
     half: float
 
     @property
-    def normalization(self) -> Normalization:
-        """The transform of this cube to [-BOX, BOX]^3."""
-        return Normalization(self.center, BOX / self.half)
-
-    @property
     def fits(self) -> bool:
         """Whether the presets' encoder covers and resolves this cube as it is."""
         return bool(np.abs(self.center).max() + self.half <= ENCODED and self.half >= MIN_SIZE * BOX)

@@ -4,7 +4,6 @@ cloud of what stands still; and a cloud that is filled up."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,22 +30,16 @@ MEDIAN = 5  # images over which depths are compared
 ROOM = 1.1  # of the cube, relative to what moves
 
 
-class Placement(NamedTuple):
-    """normalization: from the capture's coordinates to the world's; None keeps them. cloud, depths: in the world's."""
-
-    normalization: Normalization | None
-    cloud: Cloud | None
-    depths: tuple[float, float] | None
-    warnings: list[str]
-
-
-def place(capture: Capture, cameras: Sequence[Camera], moving: Cube | None) -> Placement:
-    """Determine the cube that a capture fills, and bring cloud and depths into the world's coordinates.
+def place(
+    capture: Capture, cameras: Sequence[Camera], moving: Cube | None, warnings: list[str]
+) -> tuple[Normalization | None, Cloud | None, tuple[float, float] | None]:
+    """Determine the cube that a capture fills. Returns the transform to the world's coordinates, None where the
+    capture's are kept, and cloud and depths in the world's.
 
     cameras: the distinct training cameras, in the capture's coordinates. moving: the cube of what moves, in these, too;
-    None for that of the whole scene. Raises InputError where nothing tells where the scene is.
+    None for that of the whole scene. Appends warnings. Raises InputError where nothing tells where the scene is.
     """
-    depths, warnings = _depths(capture, cameras)
+    depths = _depths(capture, cameras, warnings)
     cube = moving or _cube(capture, cameras, depths)
     if cube is None:
         warnings.append(
@@ -58,23 +51,19 @@ def place(capture: Capture, cameras: Sequence[Camera], moving: Cube | None) -> P
     if cloud is not None and capture.own_footage:
         cloud = _filled(cloud, cameras)
     if cube is None or (capture.keeps_coordinates and cube.fits):
-        return Placement(None, cloud and cloud.rounded, depths, warnings)
-    fit = cube.normalization
-    return Placement(
-        fit,
-        None if cloud is None else fit.cloud(cloud),
-        None if depths is None else (depths[0] * fit.scale, depths[1] * fit.scale),
-        warnings,
-    )
+        return None, cloud and cloud.rounded, depths
+    fit = Normalization(cube.center, BOX / cube.half)
+    cloud = None if cloud is None else fit.cloud(cloud)
+    return fit, cloud, None if depths is None else (depths[0] * fit.scale, depths[1] * fit.scale)
 
 
-def _depths(capture: Capture, cameras: Sequence[Camera]) -> tuple[tuple[float, float] | None, list[str]]:
-    """Return nearest and furthest depth, if files state them or no cloud replaces them, and warnings of a guess."""
+def _depths(capture: Capture, cameras: Sequence[Camera], warnings: list[str]) -> tuple[float, float] | None:
+    """Return nearest and furthest depth if stated, or if no cloud replaces them. Appends a warning of a guess."""
     stated = [frame.depths for frame in capture.frames if frame.split == "train" and frame.depths is not None]
     if stated:
-        return (min(near for near, _ in stated), float(np.median([far for _, far in stated]))), []
+        return min(near for near, _ in stated), float(np.median([far for _, far in stated]))
     if capture.cloud is not None or capture.keeps_coordinates:
-        return None, []
+        return None
     focus = focus_of(cameras, origin=False)
     depth = np.array([(camera.T_cam_world @ [*focus, 1.0])[2] for camera in cameras])
     behind = int((depth <= 0).sum())
@@ -84,13 +73,13 @@ def _depths(capture: Capture, cameras: Sequence[Camera]) -> tuple[tuple[float, f
             f"nearest to all optical axes: {AXES_HINT}, or give a cloud."
         )
     near, far = NEAR_FACTOR * float(depth[depth > 0].min()), FAR_FACTOR * float(depth.max())
-    if not are_parallel(cameras):
-        return (near, far), []
-    return (near, far), [
-        f"{capture.source}: there is no cloud, and all cameras look in one direction, so nothing tells how far "
-        f"away the scene is, and {near:.3g} to {far:.3g} in the capture's units is a guess: walk around what "
-        "moves, or give a cloud."
-    ]
+    if are_parallel(cameras):
+        warnings.append(
+            f"{capture.source}: there is no cloud, and all cameras look in one direction, so nothing tells how far "
+            f"away the scene is, and {near:.3g} to {far:.3g} in the capture's units is a guess: walk around what "
+            "moves, or give a cloud."
+        )
+    return near, far
 
 
 def _cube(capture: Capture, cameras: Sequence[Camera], depths: tuple[float, float] | None) -> Cube | None:

@@ -77,19 +77,17 @@ def still_surface(dataset: Dataset) -> Surface | None:
     if dataset.depths is None or len(dataset.cameras) < 3:
         return None
     stills = _stills(dataset)
-    found = _surfaces(stills, dataset.depths)
-    share = float(np.mean([kept.mean() for _, _, kept in found]))
-    points, colors = _kept(found)
-    text = f"start: {len(points)} points on surfaces, {share:.0%} of the pixels of {len(stills)} cameras"
+    places, colors, kept = _surfaces(stills, dataset.depths)
+    found, share = [(places[kept], colors[kept])], float(kept.mean(axis=1).mean())
+    text = f"start: {len(found[0][0])} points on surfaces, {share:.0%} of the pixels of {len(stills)} cameras"
     if dataset.is_rig:
-        still_count = len(points)
-        for time in np.quantile(dataset.times, MOVER_TIMES):
-            more, their_colors = _moved(dataset, stills, dataset.depths, float(time))
-            points, colors = np.concatenate([points, more]), np.concatenate([colors, their_colors])
-        if len(points) > still_count:
-            text += f", and {len(points) - still_count} on what moves, at {len(MOVER_TIMES)} times"
+        moved = [_moved(dataset, stills, dataset.depths, float(t)) for t in np.quantile(dataset.times, MOVER_TIMES)]
+        found += moved
+        if more := sum(len(points) for points, _ in moved):
+            text += f", and {more} on what moves, at {len(MOVER_TIMES)} times"
     say(text)
-    return Surface(points, colors, share) if share else None
+    points, rgb = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
+    return Surface(points, rgb, share) if share else None
 
 
 def _moved(dataset: Dataset, stills: list[_Still], bounds: tuple[float, float], time: float) -> tuple[Points, Points]:
@@ -99,24 +97,16 @@ def _moved(dataset: Dataset, stills: list[_Still], bounds: tuple[float, float], 
     """
     now = _stills(dataset, at=time)
     changes = [np.abs(one.colors - still.colors).mean(axis=2) for one, still in zip(now, stills, strict=True)]
-    moved = [_box(change).ravel() > MOVED for change in changes]
-    if not any(mask.any() for mask in moved):
+    moved = np.stack([_box(change).ravel() > MOVED for change in changes])
+    if not moved.any():
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
-    found = _surfaces(now, bounds)
-    return _kept([(*each[:2], each[2] & mask) for each, mask in zip(found, moved, strict=True)])
+    places, colors, kept = _surfaces(now, bounds)
+    return places[kept & moved], colors[kept & moved]
 
 
-def _kept(found: list[tuple[Points, Points, Mask]]) -> tuple[Points, Points]:
-    """Points and colors (N, 3) of what `_surfaces` found."""
-    points, colors = (np.concatenate([each[i][each[2]] for each in found]) for i in (0, 1))
-    return points, colors
-
-
-def _surfaces(stills: list[_Still], bounds: tuple[float, float]) -> list[tuple[Points, Points, Mask]]:
-    """Of each camera a point (H W, 3) for each pixel, its color (H W, 3), and whether a surface is there (H W,).
-
-    bounds: nearest and furthest depth, world units.
-    """
+def _surfaces(stills: list[_Still], bounds: tuple[float, float]) -> tuple[Points, Points, Mask]:
+    """Of each camera a point for each pixel (cameras, H W, 3), its color (cameras, H W, 3), and whether a surface is
+    there (cameras, H W). bounds: nearest and furthest depth, world units."""
     near, far = bounds
     planes = np.linspace(1 / far, 1 / near, DEPTHS)
     with ThreadPoolExecutor() as threads:
@@ -126,14 +116,15 @@ def _surfaces(stills: list[_Still], bounds: tuple[float, float]) -> list[tuple[P
     found = _confirmed(stills, maps, tolerance)
     known = [np.where(kept, depths, np.nan) for kept, depths in zip(found, maps, strict=True)]
     filled = [_filled(still, depths) for still, depths in zip(stills, known, strict=True)]
-    surfaces = []
+    points, surfaces = [], []
     for still, depths, believed in zip(stills, filled, known, strict=True):
         places = _places(still.camera, depths)
         agreeing, _ = _votes(places, still, stills, filled, tolerance)
         _, beyond = _votes(places, still, stills, known, tolerance)
-        kept = np.isfinite(believed.ravel()) | (np.isfinite(depths.ravel()) & (agreeing >= CONFIRMED) & (beyond == 0))
-        surfaces.append((places.astype(np.float32), still.colors.reshape(-1, 3), kept))
-    return surfaces
+        points.append(places.astype(np.float32))
+        confirmed = np.isfinite(depths.ravel()) & (agreeing >= CONFIRMED) & (beyond == 0)
+        surfaces.append(np.isfinite(believed.ravel()) | confirmed)
+    return np.stack(points), np.stack([still.colors.reshape(-1, 3) for still in stills]), np.stack(surfaces)
 
 
 def _stills(dataset: Dataset, at: float | None = None) -> list[_Still]:

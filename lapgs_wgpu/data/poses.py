@@ -23,12 +23,9 @@ OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0])  # y up, z backward -> y down, z f
 
 def check_rotation(R: Array, name: str) -> None:
     """Raise InputError unless R (3, 3) is a rotation. name: of the matrix, for errors."""
-    lengths = np.linalg.norm(R, axis=0)
     error = np.abs(R.T @ R - np.eye(3)).max()
-    if lengths.min() < 1e-6:
-        raise InputError(f"{name} has zero scale (an axis of length {lengths.min():g}); its axes must have length 1.")
     if error > ROTATION_TOLERANCE:
-        axes = " ".join(f"{x:.4g}" for x in lengths)
+        axes = " ".join(f"{x:.4g}" for x in np.linalg.norm(R, axis=0))
         raise InputError(
             f"{name} is not a rotation and a position: R^T R is {error:.3g} away from the identity (at most "
             f"{ROTATION_TOLERANCE:g} is allowed), its axes have lengths {axes}; remove scale and shear."

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import PurePosixPath
 from typing import NamedTuple
@@ -140,14 +140,16 @@ def stand_still(names: Iterable[ImageName], places: Mapping[str, NDArray[np.floa
 
 def clock_times(names: Sequence[ImageName]) -> tuple[list[float], str] | None:
     """Return the times in seconds that all names state, and what they are; None if these are no clock times, Unix
-    times or decimals, or if two images of a camera have the same.
-    """
-    stamps = [name.stamp for name in names]
+    times or decimals, or if two images of a camera have the same."""
+    matches = [match for name in names if (match := _CLOCK.search(name.stamp))]
+    clocks = [clock for match in matches if (clock := _seconds(match)) is not None]
+    dated = {match["date"] is not None for match in matches} if len(clocks) == len(names) else set()
+    unix = [float(f"{found[1]}.{found[2]}") for name in names if (found := _UNIX.search(name.stamp))]
     readings = (
-        (_of_each(stamps, _date), "clock times"),
-        (_of_each(stamps, _unix_seconds), "Unix times"),
-        (_times_of_day(names), "clock times (HHMMSS)"),
-        (_decimals(stamps), "seconds"),
+        (clocks if dated == {True} else None, "clock times"),
+        (unix if len(unix) == len(names) else None, "Unix times"),
+        (_times_of_day(names, matches, clocks) if dated == {False} else None, "clock times (HHMMSS)"),
+        (_decimals([name.stamp for name in names]), "seconds"),
     )
     for seconds, kind in readings:
         if seconds and len({(name.camera, time) for name, time in zip(names, seconds, strict=True)}) == len(names) > 1:
@@ -155,57 +157,40 @@ def clock_times(names: Sequence[ImageName]) -> tuple[list[float], str] | None:
     return None
 
 
-def _of_each(stamps: Sequence[str], read: Callable[[str], float | None]) -> list[float] | None:
-    seconds = [value for value in map(read, stamps) if value is not None]
-    return seconds if len(seconds) == len(stamps) else None
-
-
-def _date(stamp: str) -> float | None:
-    if not (found := _CLOCK.search(stamp)) or found["date"] is None or (clock := _time_of_day(found)) is None:
-        return None
-    try:
-        day = datetime.strptime(re.sub(r"\D", "", found["date"]), "%Y%m%d").replace(tzinfo=UTC)
-    except ValueError:  # 20261399_000001
-        return None
-    return day.timestamp() + clock
-
-
-def _time_of_day(found: re.Match[str]) -> float | None:
-    """Seconds from midnight of a match of _CLOCK; None where it is no time of day."""
+def _seconds(found: re.Match[str]) -> float | None:
+    """Seconds of a match of _CLOCK, from its midnight where it has no date; None where it is no possible time."""
     hour, minute, second = (int(found[part]) for part in ("hour", "minute", "second"))
     if found["half"]:
         hour = hour % 12 + 12 * (found["half"] in "Pp")
-    possible = hour < 24 and minute < 60 and second < 60
-    return 3600 * hour + 60 * minute + second + float(f"0.{found['part'] or 0}") if possible else None
-
-
-def _times_of_day(names: Sequence[ImageName]) -> list[float] | None:
-    """Seconds of HHMMSS without a date, also past midnight; None unless all are possible times of day, alike in all
-    else that the names of a camera hold, and more even as times than as numbers, which jump by 40 each minute."""
-    found = [_CLOCK.search(name.stamp) for name in names]
-    matches = [match for match in found if match and match["date"] is None]
-    clocks = [clock for match in matches if (clock := _time_of_day(match)) is not None]
-    around = {(name.camera, _CLOCK.sub("", name.stamp, count=1)) for name in names}
-    if len(clocks) < len(names) or len(around) > len({name.camera for name in names}):
+    try:
+        midnight = datetime.strptime(re.sub(r"\D", "", found["date"] or "19700101"), "%Y%m%d").replace(tzinfo=UTC)
+    except ValueError:  # 20261399_000001
         return None
-    times = np.array(clocks)
-    ordered = np.sort(times)
-    pause = int(np.argmax(np.diff(ordered, append=ordered[-1])))
-    if pause + 1 < len(ordered) and ordered[pause + 1] - ordered[pause] > _DAY / 2:
-        times = np.where(times <= ordered[pause], times + _DAY, times)
-    numbers = np.array([float(re.sub(r"\D", "", match[0])) for match in matches])
-    return times.tolist() if _unevenness(times) < _unevenness(numbers) else None
+    possible = hour < 24 and minute < 60 and second < 60
+    clock = 3600 * hour + 60 * minute + second + float(f"0.{found['part'] or 0}")
+    return midnight.timestamp() + clock if possible else None
 
 
-def _unevenness(values: NDArray[np.float64]) -> float:
+def _times_of_day(
+    names: Sequence[ImageName], matches: Sequence[re.Match[str]], clocks: Sequence[float]
+) -> list[float] | None:
+    """Seconds of HHMMSS without a date, also past midnight; None unless they are alike in all else that the names of a
+    camera hold, and more even as times than as numbers, which jump by 40 each minute."""
+    around = {(name.camera, _CLOCK.sub("", name.stamp, count=1)) for name in names}
+    if len(around) > len({name.camera for name in names}):
+        return None
+    ordered = np.sort(clocks)
+    pauses = np.diff(ordered, prepend=ordered[0])
+    evening = ordered[np.argmax(pauses)] if pauses.max() > _DAY / 2 else ordered[0]
+    times = [clock if clock >= evening else clock + _DAY for clock in clocks]
+    numbers = [float(re.sub(r"\D", "", match[0])) for match in matches]
+    return times if _unevenness(times) < _unevenness(numbers) else None
+
+
+def _unevenness(values: Sequence[float]) -> float:
     """The largest step between ascending values, in usual ones."""
     steps = np.diff(np.unique(values))
     return float(steps.max() / np.median(steps)) if len(steps) else 0.0
-
-
-def _unix_seconds(stamp: str) -> float | None:
-    found = _UNIX.search(stamp)
-    return float(f"{found[1]}.{found[2]}") if found else None
 
 
 def _decimals(stamps: Sequence[str]) -> list[float] | None:

@@ -6,11 +6,12 @@ import re
 from collections.abc import Sequence
 from contextlib import suppress
 from itertools import pairwise
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_wgpu.data.evenly import some
 from lapgs_wgpu.data.json_fields import number, read_json
 from lapgs_wgpu.data.stamps import STILL, ImageName, clock_times, natural_key
 from lapgs_wgpu.errors import InputError
@@ -32,12 +33,9 @@ def read_times(names: Sequence[ImageName], folder: Path) -> tuple[list[float], s
     path = folder / TIMES
     if path.is_file():
         return _listed(names, path), str(path)
-    folders = names[0].part in PurePosixPath(names[0].file).parts  # state the times
-    whose = f"the names of folders in {folder}" if folders else f"the names of {folder}"
-    if clocks := clock_times(names):
-        times, kind = clocks
-        return times, f"the {kind} in {whose}"
-    return [float(number) for number in frame_numbers(names)], f"the frame numbers in {whose}"
+    clocks = clock_times(names)
+    times, kind = clocks or ([float(number) for number in frame_numbers(names)], "frame numbers")
+    return times, f"the {kind} in the names of {folder}"
 
 
 def time_step(times: NDArray[np.float64]) -> float:
@@ -112,12 +110,12 @@ def frame_numbers(names: Sequence[ImageName]) -> list[int]:
     for mine in by_camera(names).values():
         files = [names[i].file for i in mine]
         rows = [[int(digits) for digits in re.findall(r"\d+", names[i].stamp)] for i in mine]
-        fewest, most = (choose(range(len(rows)), key=lambda i: len(rows[i])) for choose in (min, max))
-        if not rows[fewest] or len(rows[fewest]) < len(rows[most]):
-            other = f"it has {len(rows[fewest])} and {files[most]} has {len(rows[most])}"
+        counts = sorted((len(row), file) for row, file in zip(rows, files, strict=True))
+        (fewest, one), (most, other) = counts[0], counts[-1]
+        if not fewest or fewest < most:
             raise InputError(
-                f"the name {files[fewest]} does not state a frame number: "
-                f"{other if rows[most] else 'it has no numbers'}; write the times into {TIMES}, or number the frames."
+                f"{one} has {fewest} numbers in its name and {other} has {most}, so no frame number is told; write the "
+                f"times into {TIMES}, or number the frames."
             )
         varying = [column for column in range(len(rows[0])) if len({row[column] for row in rows}) > 1]
         if len(varying) > 1:  # a counter beside a clock of seconds, which repeats itself
@@ -131,28 +129,24 @@ def frame_numbers(names: Sequence[ImageName]) -> list[int]:
                 f"the times into {TIMES}, or put the images of each camera into a folder of their own."
             )
         column = varying[0] if varying else len(rows[0]) - 1
-        numbers: dict[int, str] = {}
+        first: dict[int, str] = {}
         for i, file, row in zip(mine, files, rows, strict=True):
             found[i] = row[column]
-            if row[column] in numbers:
+            if (before := first.setdefault(row[column], file)) != file:
                 raise InputError(
-                    f"{file} has the frame number {row[column]}, as {numbers[row[column]]} has; rename one, or "
-                    "put the images of each camera into a folder of their own."
+                    f"{file} has the frame number {row[column]}, as {before} has; rename one, or put the images of "
+                    "each camera into a folder of their own."
                 )
-            numbers[row[column]] = file
     return found
 
 
-def disorder(names: Sequence[ImageName], times: Sequence[float], *, numbered: bool) -> list[str]:
-    """Warn about cameras whose times decrease with the frame number, and about cameras that do not film together.
-
-    numbered: whether the times are frame numbers.
-    """
+def disorder(names: Sequence[ImageName], times: Sequence[float]) -> list[str]:
+    """Warn about cameras whose times decrease with the frame number, and about cameras that do not film together."""
     warnings = []
     cameras = by_camera(names)
     for mine in cameras.values():
         own = [names[i] for i in mine]
-        if numbered or clock_times(own):
+        if clock_times(own):
             continue
         with suppress(InputError):  # names without a frame number have no order
             ordered = [i for _, i in sorted(zip(frame_numbers(own), mine, strict=True))]
@@ -165,24 +159,17 @@ def disorder(names: Sequence[ImageName], times: Sequence[float], *, numbered: bo
                     "the times, or the numbers."
                 )
     spans = {camera: (min(times[i] for i in mine), max(times[i] for i in mine)) for camera, mine in cameras.items()}
-    (first_camera, (a, b)), *others = spans.items()
-    for other, (c, d) in others:
-        if c > b or d < a:
-            return [
-                *warnings,
-                f"cameras film at different times: {first_camera} from {a:g} to {b:g} and {other} from {c:g} to {d:g}; "
-                "if they filmed together, give their times, or numbers, from a common moment on.",
-            ]
     step = max(time_step(np.unique([times[i] for i in mine])) for mine in cameras.values())
     longest = max(1.5 * step, APART * (max(times) - min(times)))
-    advice = f"; if some film more images a second, or were started apart, write the times in seconds into {TIMES}"
-    for word, ends in zip(("begin", "end"), zip(*spans.values(), strict=True), strict=True):
-        if max(ends) - min(ends) > longest:
-            at: dict[float, list[str]] = {}
-            for camera, end in zip(spans, ends, strict=True):
-                at.setdefault(end, []).append(camera)
-            told = (f"{', '.join(some[:4])}{' ...' * (len(some) > 4)} at {end:g}" for end, some in at.items())
-            warnings.append(f"cameras {word} at different times: {', '.join(told)}{advice if numbered else ''}.")
+    if any(max(ends) - min(ends) > longest for ends in zip(*spans.values(), strict=True)):
+        alike = dict[tuple[float, float], list[str]]()
+        for camera, span in spans.items():
+            alike.setdefault(span, []).append(camera)
+        told = (f"{some(cameras)} from {a:g} to {b:g}" for (a, b), cameras in alike.items())
+        warnings.append(
+            f"cameras film at different times: {', '.join(told)}; if these are no seconds, since some film more images "
+            f"a second or were started apart, write the times in seconds into {TIMES}."
+        )
     return warnings
 
 

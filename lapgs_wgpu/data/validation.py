@@ -1,23 +1,19 @@
-"""Validate a capture before training. Errors and warnings name the numbers, and what to change.
-
-A capture that cannot be trained on raises InputError; otherwise each problem is a warning of one sentence.
-"""
+"""Validate a capture before training: what prevents it raises InputError, other problems are warnings."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.capture_files import MOST_ABSENT
 from lapgs_wgpu.data.cloud import Cloud, in_view, views_of
-from lapgs_wgpu.data.evenly import evenly
+from lapgs_wgpu.data.evenly import evenly, some
 from lapgs_wgpu.data.focus import FAR_APART, degrees_apart, spread
 from lapgs_wgpu.data.frames import Frame
-from lapgs_wgpu.data.images import BLURRED, EQUAL, ImageFile, blurred_and_repeated, decode, scales_to, size_text
+from lapgs_wgpu.data.images import ImageFile, decode, scales_to, size_text
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.placement import near_focus
 from lapgs_wgpu.data.poses import AXES_HINT
@@ -29,18 +25,17 @@ MIN_FOCAL, MAX_FOCAL = 0.05, 1000.0  # of an image's longer side: 169 and 0.06 d
 # A triangulated point was seen by cameras. If most points are not, cloud and cameras use different coordinates.
 MIN_SEEN = 0.5
 OFF_CENTER = 0.15  # of a side: intrinsics of images half or twice as large lie 0.25 or 0.5 away from the middle
-LOOKED_AT, DARK = 8, 64  # images of 16 bits that are decoded, and the level that a bright one of them reaches
-BLACK_AT, BLACK = 3, 16  # images of a camera that are decoded, and the level that one of them reaches
+LOOKED_AT, DARK = 8, 64  # images of 16 bits or with alpha that are decoded, and the level that one of them reaches
+BLACK_AT, BLACK = 3, 16  # the same for the images of a camera
 MIN_SPREAD = 1e-3  # of the cloud, relative to its distance from the cameras: a smaller one covers less than a pixel
-NAMED = 5  # images that a warning names
 STANDING = 0.01  # cameras with a spread below this, relative to their distance from the cloud, have no parallax
 FEW_POINTS = 100
 FEW_TIMES = 5  # fewer distinct times do not constrain motion
 GAP, GAP_FACTOR = 0.1, 4.0  # a gap is longer than this share of the clip, and than this multiple of the usual step
 
 
-def upright(frames: Sequence[Frame]) -> tuple[list[Frame], list[str]]:
-    """Turn images as their EXIF orientation says where only that fits their camera; return warnings where both fit."""
+def upright(frames: Sequence[Frame], warnings: list[str]) -> list[Frame]:
+    """Turn images as their EXIF orientation says where only that fits their camera. Appends a warning where both do."""
     turned, unclear = [], []
     for frame in frames:
         image = frame.image
@@ -51,35 +46,40 @@ def upright(frames: Sequence[Frame]) -> tuple[list[Frame], list[str]]:
             elif shown == stored or not frame.states_size:
                 unclear.append(image)
         turned.append(frame)
-    if not unclear:
-        return turned, []
-    return turned, [
-        f"{len(unclear)} of {len(frames)} images, such as {unclear[0]}, have an EXIF orientation "
-        f"({unclear[0].orientation}), and no size or principal point tells whether the poses are those of the turned "
-        "images: they are taken as they are stored; else, turn the files themselves and remove the orientation."
-    ]
+    if unclear:
+        warnings.append(
+            f"{len(unclear)} of {len(frames)} images, such as {unclear[0]}, have an EXIF orientation "
+            f"({unclear[0].orientation}), and no size or principal point tells whether the poses are those of the "
+            "turned images: they are taken as they are stored; else, turn the files and remove the orientation."
+        )
+    return turned
 
 
 def check_plausible(frames: Sequence[Frame]) -> list[str]:
-    """Warn about principal points far from the image's middle, and about images that are nearly black or transparent:
-    those of 16 bits that use fewer, and those with alpha."""
+    """Warn about principal points far from the middle, about images that are nearly black, as 16 bits that use fewer
+    are, or nearly transparent, and about cameras whose images are black."""
     warnings = []
-    off = {frame.lens: frame.where for frame in reversed(frames) if _is_off_center(frame.lens)}
+    off = [frame for frame in {frame.lens: frame for frame in reversed(frames)}.values() if _is_off_center(frame.lens)]
     if off:
-        lens, where = next(reversed(off.items()))
+        lens = off[-1].lens
         warnings.append(
-            f"{where}: the principal point ({lens.cx:.5g}, {lens.cy:.5g}) is far from the middle of images of "
+            f"{off[-1].where}: the principal point ({lens.cx:.5g}, {lens.cy:.5g}) is far from the middle of images of "
             f"{size_text(lens.size)}, in {len(off)} cameras; unless the images were cut out of larger ones, the "
             "intrinsics are those of another size, or in other units than pixels."
         )
-    images = [frame.image for frame in frames]
-    deep, transparent = [image for image in images if image.deep], [image for image in images if image.alpha]
-    if told := _low_levels(deep, slice(3), "images of 16 bits are nearly black", "level"):
-        text, highest = told
+    highest, told = _highest([frame.image for frame in frames if frame.image.deep])
+    if highest < DARK:
         bits = highest.bit_length()
-        warnings.append(f"{text}, so they seem to use {8 + bits} bits; multiply them by {2 ** (8 - bits)}.")
-    if told := _low_levels(transparent, slice(3, 4), "images are nearly transparent", "alpha"):
-        warnings.append(f"{told[0]}, and transparent pixels count as background; save the images without alpha.")
+        warnings.append(
+            f"images of 16 bits are nearly black: {told}, so they seem to use {8 + bits} bits; multiply them by "
+            f"{2 ** (8 - bits)}."
+        )
+    highest, told = _highest([frame.image for frame in frames if frame.image.alpha], "alpha")
+    if highest < DARK:
+        warnings.append(
+            f"images are nearly transparent: {told}, and transparent pixels count as background; save the images "
+            "without alpha."
+        )
     return warnings + _black_cameras(frames)
 
 
@@ -87,65 +87,54 @@ def _is_off_center(lens: Lens) -> bool:
     return max(abs(lens.cx / lens.width - 0.5), abs(lens.cy / lens.height - 0.5)) > OFF_CENTER
 
 
+def _highest(images: Sequence[ImageFile], of: str = "level", most: int = LOOKED_AT) -> tuple[int, str]:
+    """The highest level (or alpha) in some of the images, 255 where there are none, and a text that says it."""
+    looked_at = evenly(images, most)
+    channels = slice(3) if of == "level" else slice(3, 4)
+    highest = max((int(decode(image.path)[..., channels].max()) for image in looked_at), default=255)
+    such = f"in {len(looked_at)} of {len(images)}, such as {looked_at[0]}, " if looked_at else ""
+    return highest, f"{such}no {of} is above {highest} of 255"
+
+
 def _black_cameras(frames: Sequence[Frame]) -> list[str]:
-    by_camera = dict[str, list[ImageFile]]()
+    films = dict[str, list[ImageFile]]()
     for frame in frames:
-        if frame.name.camera and isinstance(frame.image, ImageFile) and not frame.image.deep:
-            by_camera.setdefault(frame.name.camera, []).append(frame.image)
-    several = {name: evenly(images, BLACK_AT) for name, images in by_camera.items() if len(images) > 1}
-    black = [name for name, images in several.items() if all(decode(i.path)[..., :3].max() < BLACK for i in images)]
-    if not black:
-        return []
-    advice = "leave them out" if len(several) > 1 else "give brighter images"
-    looked_at = several[black[0]]
+        if frame.name.camera and not frame.image.deep:
+            films.setdefault(frame.name.camera, []).append(frame.image)
+    found = {name: _highest(images, most=BLACK_AT) for name, images in films.items() if len(images) > 1}
+    black = {name: told for name, (highest, told) in found.items() if highest < BLACK}
     return [
-        f"{len(black)} of {len(several)} cameras are black, such as {black[0]}: in {len(looked_at)} of its "
-        f"{len(by_camera[black[0]])} images, such as {looked_at[0]}, no level reaches {BLACK}: {advice}."
+        f"{len(black)} of {len(found)} cameras are black, such as {name}: {told}: "
+        f"{'leave them out' if len(found) > len(black) else 'give brighter images'}."
+        for name, told in [*black.items()][:1]
     ]
 
 
-def _low_levels(images: Sequence[ImageFile], channels: slice, what: str, of: str) -> tuple[str, int] | None:
-    """Begin a warning, and return the highest level, where some channels of all images that are looked at are dark."""
-    looked_at = evenly(images, LOOKED_AT)
-    highest = max((int(decode(image.path)[..., channels].max()) for image in looked_at), default=255)
-    if highest >= DARK:
-        return None
-    told = f"{what}: in {len(looked_at)} of {len(images)}, such as {looked_at[0]}, no {of} is above {highest} of 255"
-    return told, highest
-
-
 def check_frames(frames: Sequence[Frame]) -> None:
-    """Check that all images have one size, which fits their cameras. Raises InputError."""
-    checked: set[Lens] = set()
-    first = frames[0].image
+    """Raise InputError unless all images have one size, and all lenses its proportions and plausible focal lengths."""
+    first, by_lens = frames[0].image, dict[Lens, Frame]()
     for frame in frames:
+        by_lens.setdefault(frame.lens, frame)
         if frame.image.size != first.size:
             raise InputError(
                 f"{frame.image} is {size_text(frame.image.size)} pixels and {first} is {size_text(first.size)}; all "
                 "images must have one size: crop or leave out those that differ."
             )
-        if frame.lens not in checked:
-            checked.add(frame.lens)
-            _check_lens(frame)
-
-
-def _check_lens(frame: Frame) -> None:
-    """Check that focal lengths are plausible, and that the image has the lens's proportions."""
-    lens, size, where = frame.lens, frame.image.size, frame.where
-    stated, longer = size_text(lens.size), max(lens.size)
-    for focal in (lens.fx, lens.fy):
-        if not MIN_FOCAL * longer <= focal <= MAX_FOCAL * longer:
+    for lens, frame in by_lens.items():
+        longer, stated = max(lens.size), size_text(lens.size)
+        for focal in (lens.fx, lens.fy):
+            if not MIN_FOCAL * longer <= focal <= MAX_FOCAL * longer:
+                raise InputError(
+                    f"{frame.where}: a focal length of {focal:.4g} pixels does not fit images of {stated}; it must be "
+                    f"{MIN_FOCAL:g} to {MAX_FOCAL:g} times the longer side, in pixels of that size."
+                )
+        if not scales_to(first.size, lens.size):
+            sideways = scales_to(first.size[::-1], lens.size)
+            advice = "turn it, or give the camera of the turned image" if sideways else "give the camera of this image"
             raise InputError(
-                f"{where}: a focal length of {focal:.4g} pixels does not fit images of {stated}; it must be "
-                f"{MIN_FOCAL:g} to {MAX_FOCAL:g} times the longer side, in pixels of that size."
+                f"{frame.image} is {size_text(first.size)} pixels, but {frame.where} states {stated}, which has other "
+                f"proportions{', those of the image on its side' if sideways else ''}; {advice}."
             )
-    if not scales_to(size, lens.size):
-        sideways = scales_to(size[::-1], lens.size)
-        advice = "turn it, or give the camera of the turned image" if sideways else "give the camera of this image"
-        raise InputError(
-            f"{frame.image} is {size_text(size)} pixels, but {where} states {stated}, which has other proportions"
-            f"{', those of the image on its side' if sideways else ''}; {advice}."
-        )
 
 
 def check_cloud(cloud: Cloud, cameras: Sequence[Camera], path: Path, warnings: list[str]) -> Cloud:
@@ -231,21 +220,21 @@ def check_in_view(dataset: Dataset, points: NDArray[np.floating]) -> list[str]:
 
     points: (N, 3) means of the initial Gaussians, world units. Raises InputError if no view shows any.
     """
-    seen = {camera: bool(in_view(points, camera)[1].any()) for camera in dataset.cameras}
-    if not any(seen.values()):
+    seeing = {camera for camera in dataset.cameras if in_view(points, camera)[1].any()}
+    if not seeing:
         low, high = points.min(axis=0), points.max(axis=0)
         box = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(low, high, strict=True))
         raise InputError(
             f"{dataset.name}: none of {len(dataset.train)} training cameras sees where the first Gaussians lie ({box} "
             "along x, y, z); check the poses and their axes, or raise points.box and field.bound."
         )
-    shown = {view.time for view in dataset.train if seen[view.camera]}
+    shown = {view.time for view in dataset.train if view.camera in seeing}
     blind = [view for view in dataset.train if view.time not in shown]
     if not blind:
         return []
     return [
         f"{dataset.name}: all cameras look away at {len({view.time for view in blind})} of {len(dataset.times)} times: "
-        f"{_named([view.name for view in blind])} show nothing of the scene, so its motion there is a guess; check "
+        f"{some([view.name for view in blind])} show nothing of the scene, so its motion there is a guess; check "
         "these poses, or remove these images."
     ]
 
@@ -262,29 +251,23 @@ def check_spacing(dataset: Dataset) -> list[str]:
     ]
 
 
-def check_views(cloud: Cloud, cameras: Sequence[Camera], names: Sequence[str], where: Path) -> list[str]:
+def check_views(cloud: Cloud, named: Mapping[Camera, str], where: Path) -> list[str]:
     """Warn about cameras that see no point of the cloud or hardly move, and about a sparse cloud.
 
-    cameras, names: of each image, in the coordinates of the cloud; a camera counts once, by its first image's name.
-    Raises InputError if more than half of the cameras see no point.
+    named: an image of each camera, in the coordinates of the cloud. Raises InputError if more than half see no point.
     """
-    first_name = dict(zip(reversed(cameras), reversed(names), strict=True))
-    cameras = list(dict.fromkeys(cameras))
-    points = cloud.points.astype(np.float64)
-    blind = [first_name[camera] for camera in cameras if not views_of(points, [camera]).any()]
+    points, cameras = cloud.points.astype(np.float64), list(named)
+    blind = [name for camera, name in named.items() if not in_view(points, camera)[1].any()]
     if 2 * len(blind) > len(cameras):
-        back = [Camera(c.K, np.diag([1.0, -1, -1, 1]) @ c.T_cam_world, c.width, c.height) for c in cameras]
-        turned = float(np.mean([views_of(points, [camera]).any() for camera in back]))
-        hint = f"; turned round, {100 * turned:.0f} % of them would see some: {AXES_HINT}" if turned > 0.5 else ""
         raise InputError(
             f"{where}: cameras look away from the cloud: {len(blind)} of {len(cameras)} see none of its {len(points)} "
-            f"points{hint or '; cloud and cameras have different coordinates or scales'}."
+            f"points; {AXES_HINT}, or cloud and cameras have different coordinates or scales."
         )
     warnings = []
     if blind:
         warnings.append(
-            f"cameras look away from the cloud: {_named(blind)} see none of its {len(points)} "
-            f"points ({len(blind)} of {len(cameras)} cameras); their poses may be wrong."
+            f"cameras look away from the cloud: {some(blind)} see none of its {len(points)} points ({len(blind)} of "
+            f"{len(cameras)} cameras); their poses may be wrong."
         )
     if len(points) < FEW_POINTS:
         warnings.append(
@@ -300,26 +283,3 @@ def check_views(cloud: Cloud, cameras: Sequence[Camera], names: Sequence[str], w
             "so depth cannot be told; walk around what moves."
         )
     return warnings
-
-
-def check_film(images: Sequence[Path]) -> list[str]:
-    """Warn about images of one camera, in the order of time, that are blurred or repeated."""
-    if len(images) < 3:
-        return []
-    blurry, repeated = ([image.name for image in bad] for bad in blurred_and_repeated(images))
-    found = (
-        ("blurred", blurry, f"have less than {BLURRED:g} of their neighbours' sharpness"),
-        ("repeated", repeated, f"differ by at most {EQUAL} of 255 levels from the one before: motion stands still"),
-    )
-    # Where so many are left out, what names them must not stay.
-    return [
-        f"{word} images: {_named(names)} ({len(names)} of {len(images)}) {reason}; leave them out"
-        f"{', and what names them' if len(names) > MOST_ABSENT * len(images) else ''}."
-        for word, names, reason in found
-        if names
-    ]
-
-
-def _named(names: Sequence[str]) -> str:
-    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-    return ", ".join(names[:NAMED]) + more

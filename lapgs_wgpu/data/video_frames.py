@@ -1,8 +1,5 @@
-"""Films of still cameras. Each is unpacked once into lossless images outside the capture, and read from there.
-
-Frames depend on each other: decoding one in the middle of a clip takes seconds, since all frames from the last keyframe
-on are decoded first (docs/notes/captures.md has the times), and a training reads frames in random order, again and
-again.
+"""Films of still cameras. Each is unpacked once into lossless images outside the capture, and read from there, since
+decoding a frame in the middle of a clip takes seconds (docs/notes/captures.md).
 """
 
 from __future__ import annotations
@@ -42,29 +39,27 @@ def unpacked(path: Path, image_size: int | None) -> list[ImageFile]:
     """
     shape, size = _check_header(path)
     wanted = shrunk_size(size, image_size)
-    folder = frames_folder(path, wanted, shape)
+    folder = frames_folder(path, wanted)
     if not folder.is_dir():
         _unpack(path, folder, shape, size, wanted)
     files = sorted(folder.glob("*.png"))
     return [ImageFile(file, wanted, source=f"{path}, frame {number}") for number, file in enumerate(files)]
 
 
-def frames_folder(path: Path, size: Size, shape: Display) -> Path:
+def frames_folder(path: Path, size: Size) -> Path:
     """The folder for the frames of this (width, height); size and date of the film are part of its name."""
     stat, path = path.stat(), path.resolve()
-    state = f"{stat.st_size:x}-{stat.st_mtime_ns:x}" + (f"-{shape}" if any(shape) else "")
     caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lapgs_wgpu"
-    return caches / "frames" / _place(path.parent) / f"{path.stem}-{size[0]}x{size[1]}-{state}"
+    name = f"{path.stem}-{size[0]}x{size[1]}-{stat.st_size:x}-{stat.st_mtime_ns:x}"
+    return caches / "frames" / _place(path.parent) / name
 
 
 def _check_header(path: Path) -> tuple[Display, Size]:
     """Check the header and decode the first frame: how it is shown, and the (width, height) as shown.
 
-    Raises InputError for what is no film, and for frames that are too large, too many, or not of square pixels.
+    Raises InputError for what is no film, and for frames that are too large, or not of square pixels.
     """
     with opened_film(path) as (file, stream):
-        if stream.frames > (size := path.stat().st_size):
-            raise InputError(f"{path} has {stream.frames} frames, it states, in {size} bytes; copy it again.")
         if abs(pixel_aspect(stream) - 1) > 0.01:
             raise InputError(
                 f"{path} has frames of {stream.width}x{stream.height} pixels, each {pixel_aspect(stream):.3g} times as "
@@ -83,9 +78,8 @@ def _unpack(path: Path, folder: Path, shape: Display, size: Size, wanted: Size) 
     """Write every frame, of (width, height) `size`, as PNG of the wanted size into a new folder. Raises InputError."""
     print(f"{path}: its frames are unpacked once, into {folder}", file=sys.stderr, flush=True)
     written, declared = list[Future[None]](), 0
-    room = f"{wanted[0] * wanted[1] * 1.5e-6:.1f} MB a frame"
     with (
-        new_folder(folder, f"make room there, {room}, or set XDG_CACHE_HOME to another folder") as unfinished,
+        new_folder(folder, "make room there, or set XDG_CACHE_HOME to another folder") as unfinished,
         ThreadPoolExecutor(WRITERS, thread_name_prefix="unpack") as pool,
         opened_film(path) as (file, stream),
     ):
@@ -114,12 +108,13 @@ def opened_film(path: Path) -> Iterator[tuple[Any, Any]]:
     av = import_av(path)
     try:
         with av.open(str(path), metadata_errors="replace") as file:
-            streams = [each for each in file.streams.video if not int(each.disposition) & _ATTACHED_PICTURE]
-            if not streams:
-                raise InputError(f"{path} has no video stream; give the camera's recording.")
-            decoded = [each for each in streams if each.codec_context is not None]
+            films = [each for each in file.streams.video if not int(each.disposition) & _ATTACHED_PICTURE]
+            decoded = [each for each in films if each.codec_context is not None]
             if not decoded:
-                raise InputError(f"{path} is in a format that PyAV cannot decode; convert it to H.264.")
+                raise InputError(
+                    f"{path} has {len(films)} video streams, and PyAV can decode none; give the camera's recording, or "
+                    "convert it to H.264."
+                )
             stream = max(decoded, key=lambda each: (each.width or 0) * (each.height or 0))
             if not 1 <= stream.width * stream.height <= LARGEST_FRAME:
                 raise InputError(
@@ -141,9 +136,6 @@ class Display(NamedTuple):
 
     turns: int
     mirrored: bool
-
-    def __str__(self) -> str:
-        return f"turned-{self.turns}" + ("-mirrored" if self.mirrored else "")
 
     def size(self, coded: Size) -> Size:
         """(width, height) as shown."""

@@ -19,7 +19,6 @@ from lapgs_wgpu.data.images import Size, shrink
 from lapgs_wgpu.data.masks import MOSTLY, as_pixels
 from lapgs_wgpu.data.normalize import BOX, Normalization
 from lapgs_wgpu.data.timestamps import time_step
-from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
 AROUND = 6  # cameras that tell what moves between them
@@ -29,14 +28,14 @@ GOLDEN_SECTION = (5**0.5 - 1) / 2
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One image of a capture: camera, time, and access to its pixels.
+    """One image of a capture: camera, time, and access to its pixels, which may be decoded in any thread.
 
     name: unique within its dataset and safe as a file name, such as "train_007".
     camera: its size is that of the pixels.
     time: in [0, 1] over the clip.
     source: description of the image for errors: a file, or a video and its frame.
-    pixels: decodes the image on each call, from any thread: (height, width, 3) RGB or (height, width, 4) straight (not
-        premultiplied) RGBA, uint8. Raises InputError.
+    load: decodes the image: (height, width, 3) RGB or (height, width, 4) straight (not premultiplied) RGBA, uint8.
+        Raises InputError.
     ignored: decodes the pixels of a training view that the loss leaves out: (height, width) bool. Raises InputError.
     moving: decodes the pixels of what moves: (height, width) bool. Raises InputError.
     """
@@ -45,21 +44,9 @@ class View:
     camera: Camera
     time: float
     source: str
-    pixels: Callable[[], NDArray[np.uint8]]
+    load: Callable[[], NDArray[np.uint8]]
     ignored: Callable[[], NDArray[np.bool_]] | None = None
     moving: Callable[[], NDArray[np.bool_]] | None = None
-
-    def load(self) -> NDArray[np.uint8]:
-        """Decode the image: (H, W, 3) RGB or (H, W, 4) straight RGBA, uint8, read-only. Raises InputError."""
-        image = self.pixels()
-        size = (self.camera.height, self.camera.width)
-        if image.dtype != np.uint8 or image.shape not in {(*size, 3), (*size, 4)}:
-            raise InputError(
-                f"{self.source}: expected {size[1]}x{size[0]} pixels of 3 or 4 channels in 8 bit, "
-                f"got an array of {image.shape} {image.dtype}; was the file replaced while it was in use?"
-            )
-        image.setflags(write=False)
-        return image
 
     def load_ignored(self) -> NDArray[np.bool_] | None:
         """Decode the pixels that the training loss leaves out: (H, W) bool; None for none. Raises InputError."""
@@ -187,7 +174,7 @@ def small_views(views: Sequence[View], size: int) -> list[View]:
         return dataclasses.replace(
             view,
             camera=cameras.setdefault(view.camera, view.camera.resized(*small)),
-            pixels=cache(lambda: shrink(view.load(), small)),
+            load=cache(lambda: shrink(view.load(), small)),
             ignored=None if view.ignored is None else partial(_shrunk_mask, view.ignored, small),
             moving=None if view.moving is None else cache(partial(_shrunk_mask, view.moving, small, MOSTLY)),
         )

@@ -1,15 +1,7 @@
 """Readers of what apps export: Record3D, and Polycam's raw data. Poses are in meters and ARKit's axes, as OpenGL's.
 
-Record3D: metadata.json beside rgb/0.jpg, 1.jpg, ..., or an unpacked .r3d: metadata beside rgbd/. metadata holds, for
-each frame, `poses` [qx, qy, qz, qw, x, y, z] (camera to world), `perFrameIntrinsicCoeffs` [fx, fy, cx, cy] or else one
-`K` (3x3, column by column), both in pixels of images of `w` x `h`; and `frameTimestamps` in seconds or else `fps`.
-
-Polycam: keyframes/ with a JSON file for each image, as its developer mode exports it. Polycam's optimizer writes
-corrected_cameras/ (and, where it removes a distortion, corrected_images/), which are preferred to cameras/ and images/.
-A camera file holds t_00 ... t_23 (camera to world, by rows), `fx`, `fy`, `cx`, `cy`, `width`, `height` in pixels, and
-`timestamp`, which is also the name of the file.
-
-Depth maps (.exr, .depth, .png) and the mesh are not read.
+docs/data.md lists the fields. Polycam's optimizer writes corrected_cameras/ (and, where it removes a distortion,
+corrected_images/), which are preferred to cameras/ and images/. Depth maps and the mesh are not read.
 """
 
 from __future__ import annotations
@@ -21,7 +13,7 @@ import numpy as np
 from lapgs_wgpu.data.capture_files import CaptureFiles
 from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import SUFFIXES, check_image
-from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, number, read_json, vector
+from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, matrix, number, read_json
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.poses import OPENGL_TO_OPENCV, opengl_pose, unit_quaternion, world_to_camera
 from lapgs_wgpu.data.stamps import ImageName, natural_key
@@ -61,8 +53,8 @@ def _read_record3d(folder: Path, image_size: int | None) -> Capture:
     frames = []
     for index, file in sorted(files.items()):
         where = f"{path}, frame {index}"
-        fx, fy, cx, cy = vector(intrinsics[index], 4, "perFrameIntrinsicCoeffs", where).tolist()
-        x, y, z, w, *position = vector(poses[index], 7, "poses", where)
+        fx, fy, cx, cy = matrix(intrinsics[index], (4,), "perFrameIntrinsicCoeffs", where).tolist()
+        x, y, z, w, *position = matrix(poses[index], (7,), "poses", where)
         R_world_cam = rotation_matrix(unit_quaternion(np.array([w, x, y, z]), where))
         frames.append(
             Frame(

@@ -1,25 +1,20 @@
 """Reader of COLMAP's sparse models: sparse/ or sparse/N (`colmap_model`) beside the images in images/.
 
 Each folder below images/ is a camera, or a time (`stamps`). If the model places each of several cameras at one point,
-they do not move, and images of a camera that have no pose have that of its first one. docs/own-data.md says how to make
-such a capture.
-
-Models without points, and with a camera for each image, as other programs export them, are read, too.
+they do not move, and images of a camera that have no pose have that of its first one.
 """
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
-from lapgs_wgpu.data.capture_files import CaptureFiles
+from lapgs_wgpu.data.capture_files import CaptureFiles, files_below
 from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import SUFFIXES, check_image
 from lapgs_wgpu.data.poses import place_of
 from lapgs_wgpu.data.readers.colmap_model import ColmapImage, ColmapModel, is_model, read_model
 from lapgs_wgpu.data.stamps import image_names, natural_key, stand_still
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.io.listing import is_desktop_file
 
 IMAGES, SPARSE = "images", "sparse"
 
@@ -34,7 +29,7 @@ def _read(folder: Path, image_size: int | None) -> Capture:
     chosen, model = max(models.items(), key=lambda item: len(item[1].images))  # the first of equal ones
     if not model.images:
         raise InputError(f"{chosen} holds no image with a pose; let COLMAP register the images again.")
-    files = _image_files(images)
+    files = [name for name in files_below(images) if name.lower().endswith(SUFFIXES)]
     registered, warnings = _registered(model, images, files)
     frames = _frames(model, registered, images, files, warnings)
     if len(models) > 1:
@@ -63,27 +58,10 @@ def _models(folder: Path) -> list[Path]:
     return sorted((path for path in sparse.glob("*") if is_model(path)), key=lambda path: natural_key(path.name))
 
 
-def _image_files(images: Path) -> list[str]:
-    files = []
-    entered: set[str] = set()
-    for parent, folders, names in os.walk(images, followlinks=True):
-        entered.add(os.path.realpath(parent))
-        folders[:] = [name for name in folders if os.path.realpath(os.path.join(parent, name)) not in entered]
-        files += [
-            Path(parent, name).relative_to(images).as_posix()
-            for name in names
-            if name.lower().endswith(SUFFIXES) and not is_desktop_file(name)
-        ]
-    return sorted(files, key=natural_key)
-
-
 def _registered(model: ColmapModel, images: Path, files: list[str]) -> tuple[dict[str, ColmapImage], list[str]]:
     """Return the images of the model by the names of their files, and a warning about those that have no file."""
-    finder, existing = CaptureFiles(images), set(files)
-    registered = {image.name: image for image in model.images if image.name in existing}
-    for image in model.images:
-        if image.name in existing:
-            continue
+    finder, existing, registered = CaptureFiles(images), set(files), dict[str, ColmapImage]()
+    for image in sorted(model.images, key=lambda image: image.name not in existing):
         name = finder.find_image(image.name, f"{image.where} names it")
         if name is not None and registered.setdefault(name, image) is not image:  # another image's file
             finder.absent.append(f"{images / image.name} does not exist, but {image.where} names it")

@@ -6,8 +6,9 @@ declared count reserves no memory.
 
 from __future__ import annotations
 
+import re
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.cloud import Cloud
-from lapgs_wgpu.data.images import SUFFIXES
 from lapgs_wgpu.data.json_fields import LARGEST_ENTRY, LARGEST_INTRINSIC, LARGEST_SIDE
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.poses import unit_quaternion
@@ -38,7 +38,7 @@ OTHER_MODELS = {
     14: "SIMPLE_FISHEYE", 15: "FISHEYE", 16: "EUCM", 17: "EQUIRECTANGULAR",
 }  # fmt: skip
 PARAMETERS = dict(MODELS.values())
-LONGEST_NAME = 4096  # bytes of an image's name
+_NUMBERS = re.compile(r"([-+.\deE\s]|nan|inf)*")
 
 
 class ColmapImage(NamedTuple):
@@ -75,9 +75,9 @@ def read_model(folder: Path) -> ColmapModel:
         if not path.is_file():
             raise InputError(f"{path} does not exist, but {files['cameras']} does; copy it, too.")
     try:
-        cameras = (_binary_cameras if binary else _text_cameras)(files["cameras"])
-        images = (_binary_images if binary else _text_images)(files["images"])
-        rows = (_binary_points if binary else _text_points)(files["points3D"])
+        cameras = dict((_binary_cameras if binary else _text_cameras)(files["cameras"]))
+        images = list((_binary_images if binary else _text_images)(files["images"]))
+        rows = list((_binary_points if binary else _text_points)(files["points3D"]))
     except OSError as error:
         raise InputError(f"{error.filename or folder} cannot be read ({error.strerror or error}).") from error
     for image in images:
@@ -96,7 +96,7 @@ def read_model(folder: Path) -> ColmapModel:
     return ColmapModel(cameras, images, cloud, *files.values())
 
 
-def _camera(where: str, model: str, width: float, height: float, values: list[float]) -> Lens:
+def _camera(where: str, model: str, width: float, height: float, values: Sequence[float]) -> Lens:
     if model not in PARAMETERS:
         cut = "cut pinhole views out of the panoramas"
         advice = cut if model == "EQUIRECTANGULAR" else "undistort the images with colmap image_undistorter"
@@ -106,17 +106,18 @@ def _camera(where: str, model: str, width: float, height: float, values: list[fl
         raise InputError(f"{where}: a {model} has {len(names)} parameters ({', '.join(names)}), not {len(values)}.")
     if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE):
         raise InputError(f"{where}: sides must be 1 to {LARGEST_SIDE:g} pixels, got {shown(width)}x{shown(height)}.")
-    for name, value in zip(names, values, strict=True):
+    p = dict(zip(names, values, strict=True))
+    for name, value in p.items():
         if not abs(value) <= LARGEST_INTRINSIC or (name[0] == "f" and value <= 0):  # true for NaN, too
             raise InputError(f"{where}: {name} is {value:g}, which no camera has.")
-    p = dict(zip(names, values, strict=True))
     fx, fy = p.get("fx", p.get("f", 0.0)), p.get("fy", p.get("f", 0.0))
     radial, tangential = (p.get("k1", 0.0), p.get("k2", 0.0), 0.0), (p.get("p1", 0.0), p.get("p2", 0.0))
     return Lens(int(width), int(height), fx, fy, p["cx"], p["cy"], radial=radial, tangential=tangential)
 
 
-def _image(name: str, camera: int, pose: Array, where: str) -> ColmapImage:
-    """Check the values of an image. pose: (7,) quaternion and translation. Raises InputError."""
+def _image(name: str, camera: int, values: Sequence[float], where: str) -> ColmapImage:
+    """Check the values of an image: a quaternion and a translation. Raises InputError."""
+    pose = np.array(values)
     bad = ~(np.abs(pose) <= LARGEST_ENTRY)  # true for NaN, too
     if bad.any():
         raise InputError(f"{where}: its pose holds {pose[bad][0]:g}; at most {LARGEST_ENTRY:g} is allowed.")
@@ -128,31 +129,23 @@ def _image(name: str, camera: int, pose: Array, where: str) -> ColmapImage:
 # Text
 
 
-def _lines(path: Path, fields: str, *, images: bool = False) -> Iterator[tuple[str, list[str]]]:
-    """Yield the place of each line, for errors, and its words, at least those that `fields` lists; skip comments.
-
-    images: each line ends with an image's name, which may have blanks. After it, a line of points, which may be empty,
-    is left out; some programs write none, and then another image follows at once.
-    """
-    least = fields.count(",") + 1
-    points_follow = False
+def _lines(path: Path) -> Iterator[tuple[str, str]]:
+    """Yield the place of each line, for errors, and the line; neither comments nor empty ones."""
     try:
         with path.open(encoding="utf-8") as file:
-            lines = ((number, line) for number, line in enumerate(file, start=1) if not line.startswith("#"))
-            for number, line in lines:
-                words = line.strip().split(maxsplit=least - 1 if images else -1)
-                is_image = len(words) == least and words[-1].lower().endswith(SUFFIXES)
-                if points_follow and not is_image:
-                    points_follow = False
-                    continue
-                if not words:
-                    continue
-                if len(words) < least:
-                    raise InputError(f"{path}, line {number} has {len(words)} fields, and needs {least}: {fields}.")
-                yield f"{path}, line {number}", words
-                points_follow = images
+            for number, line in enumerate(file, start=1):
+                if line.strip() and not line.startswith("#"):
+                    yield f"{path}, line {number}", line.strip()
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not text ({error.reason}); copy it or export the model again.") from None
+
+
+def _words(line: str, where: str, fields: str, most: int = -1) -> list[str]:
+    """Split a line into words, at least those that `fields` lists. most: after how many it is not split."""
+    words, least = line.split(maxsplit=most), fields.count(",") + 1
+    if len(words) < least:
+        raise InputError(f"{where} has {len(words)} fields, and needs {least}: {fields}.")
+    return words
 
 
 def _numbers(words: list[str], where: str, kind: Callable[[str], Any] = float) -> list[Any]:
@@ -162,96 +155,84 @@ def _numbers(words: list[str], where: str, kind: Callable[[str], Any] = float) -
         raise InputError(f"{where}: {str(error)[:80]}; export the model again.") from None
 
 
-def _text_cameras(path: Path) -> dict[int, Lens]:
-    cameras = {}
-    for where, words in _lines(path, "id, model, width, height"):
+def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
+    for where, line in _lines(path):
+        words = _words(line, where, "id, model, width, height")
         identity, width, height = _numbers([words[0], *words[2:4]], where, int)
-        cameras[identity] = _camera(where, words[1], width, height, _numbers(words[4:], where))
-    return cameras
+        yield identity, _camera(where, words[1], width, height, _numbers(words[4:], where))
 
 
-def _text_images(path: Path) -> list[ColmapImage]:
-    """An image is a line of pose and name; a line of its points, which may be none, mostly follows."""
-    images = []
-    for where, words in _lines(path, "id, QW, QX, QY, QZ, TX, TY, TZ, camera, name", images=True):
-        name = words[9]
-        (camera,) = _numbers(words[8:9], where, int)
-        images.append(_image(name, camera, np.array(_numbers(words[1:8], where)), f"{where} ({name[:80]})"))
-    return images
+def _text_images(path: Path) -> Iterator[ColmapImage]:
+    """Each is a line that ends with a name; after it mostly comes one of its points, three numbers each."""
+    for where, line in _lines(path):
+        if len(line.split()) == 10 or not _NUMBERS.fullmatch(line):
+            words = _words(line, where, "id, QW, QX, QY, QZ, TX, TY, TZ, camera, name", most=9)
+            (camera,) = _numbers(words[8:9], where, int)
+            yield _image(words[9], camera, _numbers(words[1:8], where), f"{where} ({words[9][:80]})")
 
 
-def _text_points(path: Path) -> list[Any]:
+def _text_points(path: Path) -> Iterator[Sequence[float]]:
     """Rows of X, Y, Z, R, G, B."""
-    return [_numbers(words[1:7], where) for where, words in _lines(path, "id, X, Y, Z, R, G, B, error")]
+    for where, line in _lines(path):
+        yield _numbers(_words(line, where, "id, X, Y, Z, R, G, B, error")[1:7], where)
 
 
 # Binary: little-endian, each file begins with a count of 8 bytes
 
 
 class _Bytes:
+    """The bytes of a file, taken one after another. Raises InputError where they are too few or too many."""
+
     def __init__(self, path: Path) -> None:
         self.path, self.at, self.data = path, 0, path.read_bytes()
 
-    def damaged(self, problem: str) -> InputError:
-        return InputError(
-            f"{self.path} {problem}; it is damaged, or of another version: copy it, or export it as text."
-        )
+    def check(self, holds: bool) -> None:
+        if not holds:
+            raise InputError(
+                f"{self.path} has {len(self.data)} bytes and does not end where it should, seen from byte {self.at}; "
+                "it is damaged, or of another version: copy it, or export it as text."
+            )
 
-    def take(self, form: str) -> tuple[Any, ...]:
-        """Return the next values, by struct's names for their types."""
-        size = struct.calcsize("<" + form)
-        self.skip(size)
-        return struct.unpack_from("<" + form, self.data, self.at - size)
-
-    def skip(self, size: int) -> None:
-        if size > len(self.data) - self.at:
-            raise self.damaged(f"ends too early: {size} bytes are needed at byte {self.at} of {len(self.data)}")
+    def take(self, size: int) -> bytes:
+        self.check(size <= len(self.data) - self.at)
         self.at += size
+        return self.data[self.at - size : self.at]
 
-    def count(self) -> int:
-        return int(self.take("Q")[0])
+    def values(self, form: str) -> tuple[Any, ...]:
+        """Return the next values, by struct's names for their types."""
+        return struct.unpack(f"<{form}", self.take(struct.calcsize(f"<{form}")))
 
     def name(self) -> str:
-        end = self.data.find(b"\0", self.at, self.at + LONGEST_NAME)
-        if end < 0:
-            raise self.damaged(f"has a name at byte {self.at} that does not end within {LONGEST_NAME} bytes")
-        text = self.data[self.at : end].decode("utf-8", "replace")
-        self.at = end + 1
-        return text
+        end = self.data.find(b"\0", self.at)
+        self.check(end >= 0)
+        return self.take(end + 1 - self.at)[:-1].decode("utf-8", "replace")
 
-    def end(self) -> None:
-        """Check that all bytes were read."""
-        if self.at < len(self.data):
-            raise self.damaged(f"declares {self.at} bytes, but has {len(self.data)}")
+    def entries(self) -> Iterator[int]:
+        """Count the entries, as many as the file declares, and then check that all bytes were taken."""
+        yield from range(self.values("Q")[0])
+        self.check(self.at == len(self.data))
 
 
-def _binary_cameras(path: Path) -> dict[int, Lens]:
-    cameras, file = {}, _Bytes(path)
-    for index in range(file.count()):
-        identity, model, width, height = file.take("iiQQ")
+def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
+    file = _Bytes(path)
+    for index in file.entries():
+        identity, model, width, height = file.values("iiQQ")
         name, names = MODELS.get(model, (OTHER_MODELS.get(model, f"number {model}"), ()))
-        values = list(file.take(f"{len(names)}d"))
-        cameras[identity] = _camera(f"{path}, camera {index}", name, width, height, values)
-    file.end()
-    return cameras
+        yield identity, _camera(f"{path}, camera {index}", name, width, height, file.values(f"{len(names)}d"))
 
 
-def _binary_images(path: Path) -> list[ColmapImage]:
-    images, file = [], _Bytes(path)
-    for index in range(file.count()):
-        _, *pose, camera = file.take("i7di")
+def _binary_images(path: Path) -> Iterator[ColmapImage]:
+    file = _Bytes(path)
+    for index in file.entries():
+        _, *pose, camera = file.values("i7di")
         name = file.name()
-        file.skip(24 * file.count())
-        images.append(_image(name, camera, np.array(pose), f"{path}, image {index} ({name[:80]})"))
-    file.end()
-    return images
+        file.take(24 * file.values("Q")[0])
+        yield _image(name, camera, pose, f"{path}, image {index} ({name[:80]})")
 
 
-def _binary_points(path: Path) -> list[Any]:
+def _binary_points(path: Path) -> Iterator[Sequence[float]]:
     """Rows of X, Y, Z, R, G, B."""
-    file, rows = _Bytes(path), []
-    for _ in range(file.count()):
-        rows.append(file.take("Q3d3Bd")[1:7])
-        file.skip(8 * file.count())
-    file.end()
-    return rows
+    file = _Bytes(path)
+    for _ in file.entries():
+        yield file.values("Q3d3Bd")[1:7]
+        file.take(8 * file.values("Q")[0])

@@ -1,7 +1,6 @@
 """Reader of the HyperNeRF format, the layout of nerfies.
 
-scene.json, dataset.json, metadata.json, camera/ID.json and rgb/Nx/ID.png; optional are points.npy and points3D*.ply.
-docs/data.md lists the fields. Cameras and points are returned in the coordinates of scene.json: (p - center) scale.
+docs/data.md lists the files. Cameras and points are returned in the coordinates of scene.json: (p - center) scale.
 """
 
 from __future__ import annotations
@@ -16,12 +15,12 @@ from lapgs_wgpu.data.capture_files import CaptureFiles
 from lapgs_wgpu.data.cloud import find_cloud, read_cloud
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import check_image
-from lapgs_wgpu.data.json_fields import LARGEST_SIDE, Fields, as_fields, kind, matrix, number, read_json
+from lapgs_wgpu.data.json_fields import LARGEST_SIDE, Fields, as_fields, matrix, number, read_json
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.normalize import Normalization
 from lapgs_wgpu.data.poses import check_rotation, world_to_camera
 from lapgs_wgpu.data.stamps import ImageName
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.errors import InputError, shown
 
 CLOUDS = ("points.npy", "points3D_downsample*.ply", "points3D.ply")  # all in the coordinates of the camera files
 TINY = 1e-12  # smaller values count as 0
@@ -30,13 +29,13 @@ STRIDE = 4  # without val_ids: every fourth id from the first on is for training
 
 def _read(folder: Path, image_size: int | None) -> Capture:
     """Images come from the folder rgb/Nx with the smallest that are at least of the wanted size, else the largest."""
-    ids, train_ids, test_ids = _splits(_object(folder / "dataset.json"))
-    scene = _object(folder / "scene.json")
+    ids, train_ids, test_ids = _splits(read_json(folder / "dataset.json"))
+    scene = read_json(folder / "scene.json")
     moved = Normalization(scene.vector("center", 3), scene.number("scale", TINY))
     depths = scene.number("near", TINY), scene.number("far", TINY)
     if depths[0] >= depths[1]:
         raise InputError(f"{scene.where}: near must be below far, got {depths[0]:g} and {depths[1]:g}.")
-    times = _times(_object(folder / "metadata.json"), ids)
+    times = _times(read_json(folder / "metadata.json"), ids)
     rgb = _image_folder(folder / "rgb", train_ids + test_ids, image_size)
     files = CaptureFiles(rgb)
     splits: dict[Split, list[str]] = {"train": train_ids, "test": test_ids}
@@ -47,20 +46,10 @@ def _read(folder: Path, image_size: int | None) -> Capture:
             if image is None:
                 continue
             where = folder / "camera" / f"{name}.json"
-            lens, pose = _read_camera(_object(where))
-            frames.append(
-                Frame(
-                    check_image(rgb / image),
-                    lens,
-                    moved.pose(pose),
-                    f"{where} (image_size, focal_length, radial_distortion, tangential_distortion)",
-                    ImageName(name),
-                    time=times[name],
-                    split=split,
-                    label=f"{index:03d}",
-                    depths=depths,
-                )
-            )
+            lens, pose = _read_camera(read_json(where))
+            told = f"{where} (image_size, focal_length, radial_distortion, tangential_distortion)"
+            taken = check_image(rgb / image), lens, moved.pose(pose), told, ImageName(name)
+            frames.append(Frame(*taken, times[name], split, f"{index:03d}", depths))
     cloud = find_cloud(folder, CLOUDS)
     return Capture(
         frames,
@@ -76,22 +65,20 @@ def _read(folder: Path, image_size: int | None) -> Capture:
 
 def _splits(data: Fields) -> tuple[list[str], list[str], list[str]]:
     """Return all ids, and those to train on and to test on."""
-    ids, test = _names(data, "ids"), _names(data, "val_ids") if data.values.get("val_ids") else []
-    if test:
-        train = _names(data, "train_ids")
-        both = [name for name in train if name in set(test)]
-        if both:
-            raise InputError(
-                f"{data.where}: {len(both)} of {len(test)} val_ids are train_ids, too, such as {both[0]}; no test "
-                "image may be trained on: remove them from one of the two."
-            )
-    else:  # "interp": the frames between
-        train, test = ids[::STRIDE], ids[STRIDE // 2 :: STRIDE]
+    ids, given = _names(data, "ids"), bool(data.values.get("val_ids"))
+    train = _names(data, "train_ids") if given else ids[::STRIDE]
+    test = _names(data, "val_ids") if given else ids[STRIDE // 2 :: STRIDE]  # "interp": the frames between
     if not train or not test:
         raise InputError(f"{data.where}: {len(train)} train_ids and {len(test)} test ids; at least one of each.")
-    for field, names in (("train_ids", train), ("val_ids", test)):
-        for name in set(names) - set(ids):
-            raise InputError(f"{data.where}: {field} names {name}, none of its {len(ids)} ids; add it there.")
+    if both := set(train) & set(test):
+        raise InputError(
+            f"{data.where}: {len(both)} of {len(test)} val_ids are train_ids, too, such as {min(both)}; no test image "
+            "may be trained on: remove them from one of the two."
+        )
+    if unknown := {*train, *test} - {*ids}:
+        raise InputError(
+            f"{data.where}: train_ids or val_ids name {min(unknown)}, none of its {len(ids)} ids; add it there."
+        )
     return ids, train, test
 
 
@@ -135,18 +122,12 @@ def _image_folder(rgb: Path, names: Sequence[str], image_size: int | None) -> Pa
     return best
 
 
-def _object(path: Path) -> Fields:
-    if not path.is_file():
-        raise InputError(f"{path} does not exist; a capture in nerfies' layout needs it.")
-    return read_json(path)
-
-
 def _names(data: Fields, field: str) -> list[str]:
     """Return a list of ids, each of which is safe as a file name."""
     names = data.entries(field)
     for name in names:
         if not isinstance(name, str) or not re.fullmatch(r"\w[\w.-]{0,99}", name):
-            raise InputError(f"{data.where}: {field} holds {kind(name)}, no id (letters, digits and . _ - only).")
+            raise InputError(f"{data.where}: {field} holds {shown(name)}, no id (letters, digits and . _ - only).")
     if len(set(names)) < len(names):
         raise InputError(f"{data.where}: {field} holds {len(names)} ids, {len(set(names))} different; name each once.")
     return names

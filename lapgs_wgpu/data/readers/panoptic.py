@@ -1,8 +1,6 @@
 """Reader of the layout of Dynamic 3D Gaussians: CMU Panoptic's calibrated cameras, which stand still and film together.
 
-train_meta.json and test_meta.json hold `w`, `h` and, for each time, lists over the cameras: `k` (3x3 intrinsics,
-pixels), `w2c` (world to camera, OpenCV's axes), `fn` (the image below ims/) and `cam_id`. Source: Luiten et al.,
-Dynamic 3D Gaussians (3DV 2024). init_pt_cld.npz, the depth cameras' cloud of the published figures, is not read.
+docs/data.md lists the fields. Source: Luiten et al., Dynamic 3D Gaussians (3DV 2024).
 """
 
 from __future__ import annotations
@@ -13,11 +11,11 @@ import numpy as np
 
 from lapgs_wgpu.data.capture_files import CaptureFiles
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
-from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, Fields, kind, matrix, read_json
+from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, Fields, matrix, read_json
 from lapgs_wgpu.data.lens import Lens
-from lapgs_wgpu.data.poses import Array, check_rotation, place_of, world_to_camera
+from lapgs_wgpu.data.poses import check_rotation, place_of, world_to_camera
 from lapgs_wgpu.data.stamps import ImageName
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.errors import InputError, shown
 
 IMAGES = "ims"
 FILES: dict[Split, str] = {"train": "train_meta.json", "test": "test_meta.json"}
@@ -42,25 +40,23 @@ def _read_split(folder: Path, data: Fields, split: Split, warnings: list[str]) -
     times = len(data.entries("fn"))
     columns = {name: data.entries(name, times) for name in ("fn", "k", "w2c", "cam_id")}
     images = CaptureFiles(folder / IMAGES)
-    frames, lenses, poses, count = [], dict[str, Lens](), dict[str, Array](), 0
+    frames, count = [], 0
     for time in range(times):
         here = Fields({name: column[time] for name, column in columns.items()}, f"{data.where}, time {time}")
         names = here.entries("fn")
         others = [here.entries(name, len(names)) for name in ("k", "w2c", "cam_id")]
         for file, k, w2c, camera in zip(names, *others, strict=True):
             count += 1
-            where = f"{here.where}, image {kind(file)}"
+            where = f"{here.where}, image {shown(file)}"
             if (named := images.image(Fields({"fn": file}, here.where), "fn")) is None:
                 continue
             found, image = named
-            # The same for all times of a camera, as a rule: each is checked once.
-            lens, pose = str(k), str(w2c)
-            lenses[lens] = lenses.get(lens) or _lens(k, width, height, where)
-            if pose not in poses:
-                poses[pose] = _pose(w2c, where)
+            T = matrix(w2c, (4, 4), "w2c", where)
+            check_rotation(T[:3, :3], f"{where}: w2c")
+            lens, pose = _lens(k, width, height, where), world_to_camera(T[:3, :3].T, place_of(T))
             name = ImageName(found, str(PurePosixPath(found).parent))
-            label = f"cam{kind(camera)}_{time:05d}"
-            frames.append(Frame(image, lenses[lens], poses[pose], where, name, time=time, split=split, label=label))
+            label = f"cam{shown(camera)}_{time:05d}"
+            frames.append(Frame(image, lens, pose, where, name, time=time, split=split, label=label))
     warnings += images.left_out(count, folder / FILES[split])
     return frames
 
@@ -72,13 +68,6 @@ def _lens(k: object, width: int, height: int, where: str) -> Lens:
     if np.abs(K[[1, 2, 2, 2], [0, 0, 1, 2]] - [0, 0, 0, 1]).max() > 0:
         raise InputError(f"{where}: k must be the rows fx s cx, 0 fy cy, 0 0 1.")
     return Lens(width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2], K[0, 1])
-
-
-def _pose(w2c: object, where: str) -> Array:
-    """(4, 4) of a field w2c. Raises InputError."""
-    T = matrix(w2c, (4, 4), "w2c", where)
-    check_rotation(T[:3, :3], f"{where}: w2c")
-    return world_to_camera(T[:3, :3].T, place_of(T))
 
 
 LAYOUT = "train_meta.json and test_meta.json beside ims/"

@@ -1,17 +1,8 @@
-"""Readers of captures with LLFF's poses_bounds.npy: Neu3D (DyNeRF), and EndoNeRF.
+"""Readers of captures with LLFF's poses_bounds.npy: Neu3D (DyNeRF), and EndoNeRF. docs/data.md lists the files.
 
 A row of 17 numbers holds a 3x5 matrix [R, position, (height, width, focal length)], then nearest and furthest depth.
-The pose is camera to world.
-
-Neu3D: synchronized cameras that do not move. A row for each camera; R has the columns down, right and backward (LLFF).
-camXX.mp4 or camXX/images/*.png hold the frames, in the order of the rows; a cloud (CLOUDS) is optional. The first
-camera is for testing, as in published work, and frame i of n has the time i / n.
-
-EndoNeRF: one camera that stands still before something that moves, such as an endoscope. A row for each image in
-images/; R has the columns right, down and forward, as EndoNeRF's successors read it; in published scenes R is the
-identity and the position 0. depth/ is optional: PNG of 8 or 16 bits, depths along the optical axis in the units of the
-bounds, 0 where unknown; without it nothing tells any depth. masks/ (tools) are not read. Images 1, 9, 17, ... are for
-testing, as in published work.
+The pose is camera to world. R has the columns down, right and backward (LLFF); EndoNeRF's right, down and forward, as
+its successors read it. In both, what is for testing follows published work.
 """
 
 from __future__ import annotations
@@ -24,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.cloud import Cloud, find_cloud, read_cloud, read_npy
+from lapgs_wgpu.data.cloud import Cloud, find_cloud, points_at, read_cloud, read_npy
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import SUFFIXES, ImageFile, check_image, decode, decode_gray, size_text
@@ -35,6 +26,7 @@ from lapgs_wgpu.data.stamps import ImageName, natural_key
 from lapgs_wgpu.data.video_frames import unpacked
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.listing import listed
+from lapgs_wgpu.splat.camera import Camera
 
 POSES = "poses_bounds.npy"
 CAMERA = re.compile(r"cam(\d{1,4})")
@@ -146,26 +138,19 @@ def _recordings(folder: Path, image_size: int | None) -> dict[Path, list[ImageFi
     films = [child for child in children if child.suffix.lower() == ".mp4"]
     folders = [child for child in children if (child / IMAGES).is_dir()]
     cameras = {child.stem for child in (*films, *folders)}
-    if len(cameras) < 2:
-        raise InputError(
-            f"{folder} holds the recordings of {len(cameras)} cameras, cam00.mp4, ... or cam00/images/*.png, ...; "
-            "at least 2 are needed: one for testing, one for training."
-        )
-    if len(folders) == len(cameras):
-        return {path: _of_folder(path / IMAGES) for path in folders}
-    if len(films) < len(cameras):
-        raise InputError(
-            f"{folder} holds films of {len(films)} cameras and images of {len(folders)}, and either must be of all "
-            f"{len(cameras)}; add what is missing."
-        )
-    return {path: unpacked(path, image_size) for path in films}
+    if len(folders) == len(cameras) >= 2:
+        return {path: _images(path / IMAGES) for path in folders}
+    if len(films) == len(cameras) >= 2:
+        return {path: unpacked(path, image_size) for path in films}
+    raise InputError(
+        f"{folder} holds films of {len(films)} cameras and images of {len(folders)}; it needs cam00.mp4, ... or "
+        "cam00/images/*.png, ... of all, and of 2 at least: one for testing, one for training."
+    )
 
 
-def _of_folder(folder: Path, *, whole: bool = False) -> list[ImageFile]:
-    """Return the images of a folder, by number. whole: of `check_image`; whole, those of a rig may be gigabytes.
-
-    Raises InputError if there is none.
-    """
+def _images(folder: Path, *, whole: bool = False) -> list[ImageFile]:
+    """Return the images of a folder, by number. whole: of `check_image`; those of a rig may be gigabytes. Raises
+    InputError if there is none."""
     files = sorted((f for f in listed(folder) if f.suffix.lower() in SUFFIXES), key=lambda f: natural_key(f.name))
     if not files:
         raise InputError(f"{folder} holds no images (.png or .jpg); extract the camera's frames into it.")
@@ -177,7 +162,7 @@ def _of_folder(folder: Path, *, whole: bool = False) -> list[ImageFile]:
 
 def _read_endonerf(folder: Path, image_size: int | None) -> Capture:
     path = folder / POSES
-    images = _of_folder(folder / IMAGES, whole=True)
+    images = _images(folder / IMAGES, whole=True)
     names = [image.path.name for image in images]
     rows = _read_rows(path, names, "images", np.eye(3))
     frames = [
@@ -205,7 +190,7 @@ def _read_endonerf(folder: Path, image_size: int | None) -> Capture:
 
 def _depth_cloud(folder: Path, frames: list[Frame]) -> Cloud:
     """Make points at the depths of some of the maps, in their images' colors. Raises InputError."""
-    maps = [image.path for image in _of_folder(folder / DEPTH)]
+    maps = [image.path for image in _images(folder / DEPTH)]
     if len(maps) != len(frames):
         raise InputError(
             f"{folder / DEPTH} holds {len(maps)} maps for {len(frames)} images; add the rest, or remove it."
@@ -222,10 +207,9 @@ def _depth_cloud(folder: Path, frames: list[Frame]) -> Cloud:
         row, column = np.nonzero(depth > 0)
         kept = random.permutation(len(row))[: MOST_POINTS // len(chosen)]
         row, column = row[kept], column[kept]
-        pixels = np.stack([column + 0.5, row + 0.5, np.ones(len(row))], axis=1)
-        rays = pixels @ np.linalg.inv(frame.lens.resized(image.shape[1], image.shape[0]).K).T
-        R, t = frame.T_cam_world[:3, :3], frame.T_cam_world[:3, 3]
-        points.append((depth[row, column, None] * rays - t) @ R)
+        height, width = depth.shape
+        camera = Camera(frame.lens.resized(width, height).K, frame.T_cam_world, width, height)
+        points.append(points_at(camera, np.column_stack([column + 0.5, row + 0.5]), depth[row, column]))
         colors.append(image[row, column] / 255)
     if not sum(map(len, points)):
         raise InputError(f"{folder / DEPTH}: all depths are 0, which means unknown; remove the folder.")

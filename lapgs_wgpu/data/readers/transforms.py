@@ -1,13 +1,8 @@
 """Readers of transforms files: nerfstudio's transforms.json, and D-NeRF's transforms_{train,test,val}.json.
 
 Both list frames: path, pose (`transform_matrix`, camera to world, OpenGL's axes) and perhaps time of each image, with
-intrinsics of each or of all. docs/data.md lists the fields.
-
-nerfstudio: the cloud of ply_file_path is in the coordinates of transform_matrix, since applied_transform was applied to
-both. Apps that write ARKit's or ARCore's poses in this form state `timestamp` instead of `time`.
-
-D-NeRF: times lie in [0, 1]; frames without are evenly spaced. transforms_val.json is optional, and left out with a
-warning if it is not usable. A cloud (CLOUDS) is optional.
+intrinsics of each or of all. docs/data.md lists the fields. nerfstudio's cloud is in the coordinates of
+transform_matrix, since applied_transform was applied to both.
 """
 
 from __future__ import annotations
@@ -20,12 +15,12 @@ from lapgs_wgpu.data.capture_files import CaptureFiles
 from lapgs_wgpu.data.cloud import find_cloud, is_random, read_cloud
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import SIDEWAYS, ImageFile
-from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, LARGEST_SIDE, Fields, kind, number, read_json
+from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, LARGEST_SIDE, Fields, number, read_json
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.poses import opengl_pose
 from lapgs_wgpu.data.stamps import ImageName, image_names
 from lapgs_wgpu.data.validation import check_frames
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.errors import InputError, shown
 from lapgs_wgpu.splat.camera import intrinsics_of_fov
 
 CLOUDS = ("fused.ply", "points3d.ply", "points3D.ply")
@@ -78,7 +73,7 @@ def read_lens(frame: Fields, shared: Fields, image: ImageFile) -> tuple[Lens, bo
 
     model = source("camera_model").values.get("camera_model", "OPENCV")
     if model not in MODELS or source("is_fisheye").values.get("is_fisheye"):
-        named = kind(model) if model not in MODELS else "is_fisheye"
+        named = shown(model) if model not in MODELS else "is_fisheye"
         raise InputError(
             f"{frame.where}: camera_model {named} is none that is read ({', '.join(MODELS)}); undistort the images."
         )
@@ -170,7 +165,7 @@ def _listed(data: Fields, field: str, names: list[str], files: CaptureFiles) -> 
     """Return the images that a list of the file names and that exist. Raises InputError for one that no frame names."""
     listed = data.values.get(field) or []
     if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
-        raise InputError(f"{data.where}: {field} must be a list of names, got {kind(listed)}.")
+        raise InputError(f"{data.where}: {field} must be a list of names, got {shown(listed)}.")
     known, found = set(names), []
     stated = {PurePosixPath(str(entry["file_path"]).replace("\\", "/")) for entry in data.values["frames"]}
     for name in listed:
