@@ -112,28 +112,27 @@ def _black_cameras(frames: Sequence[Frame]) -> list[str]:
 
 def check_frames(frames: Sequence[Frame]) -> None:
     """Raise InputError unless all images have one size, and all lenses its proportions and plausible focal lengths."""
-    first, by_lens = frames[0].image, dict[Lens, Frame]()
-    for frame in frames:
-        by_lens.setdefault(frame.lens, frame)
-        if frame.image.size != first.size:
-            raise InputError(
-                f"{frame.image} is {size_text(frame.image.size)} pixels and {first} is {size_text(first.size)}; all "
-                "images must have one size: crop or leave out those that differ."
-            )
-    for lens, frame in by_lens.items():
-        longer, stated = max(lens.size), size_text(lens.size)
+    for lens, frame in {frame.lens: frame for frame in reversed(frames)}.items():
+        longer, stated, size = max(lens.size), size_text(lens.size), frame.image.size
         for focal in (lens.fx, lens.fy):
             if not MIN_FOCAL * longer <= focal <= MAX_FOCAL * longer:
                 raise InputError(
                     f"{frame.where}: a focal length of {focal:.4g} pixels does not fit images of {stated}; it must be "
                     f"{MIN_FOCAL:g} to {MAX_FOCAL:g} times the longer side, in pixels of that size."
                 )
-        if not scales_to(first.size, lens.size):
-            sideways = scales_to(first.size[::-1], lens.size)
+        if not scales_to(size, lens.size):
+            sideways = scales_to(size[::-1], lens.size)
             advice = "turn it, or give the camera of the turned image" if sideways else "give the camera of this image"
             raise InputError(
-                f"{frame.image} is {size_text(first.size)} pixels, but {frame.where} states {stated}, which has other "
+                f"{frame.image} is {size_text(size)} pixels, but {frame.where} states {stated}, which has other "
                 f"proportions{', those of the image on its side' if sideways else ''}; {advice}."
+            )
+    first = frames[0].image
+    for image in (frame.image for frame in frames):
+        if image.size != first.size:
+            raise InputError(
+                f"{image} is {size_text(image.size)} pixels and {first} is {size_text(first.size)}; all images must "
+                "have one size: crop or leave out those that differ."
             )
 
 
