@@ -52,7 +52,7 @@ MOUSE = (
     ("wheel", "nearer or farther"),
     ("double click", "turn about what lies there"),
 )
-_BY_KEY = {key.key: key for key in KEYS} | {"/": KEYS[-1]}  # where "?" is told as "/" with Shift
+_BY_KEY = {key.key: key for key in KEYS} | {"/": KEYS[-1]}  # "?" may arrive as "/" with Shift
 ORBIT = 0.008  # radians a pixel of dragging
 ZOOM = 0.0015  # of the distance's logarithm a pixel of the wheel
 

@@ -114,8 +114,8 @@ def frame_numbers(names: Sequence[ImageName]) -> list[int]:
         (fewest, one), (most, other) = counts[0], counts[-1]
         if not fewest or fewest < most:
             raise InputError(
-                f"{one} has {fewest} numbers in its name and {other} has {most}, so no frame number is told; write the "
-                f"times into {TIMES}, or number the frames."
+                f"{one} has {fewest} numbers in its name and {other} has {most}, so which is the frame's is "
+                f"not clear; write the times into {TIMES}, or number the frames."
             )
         varying = [column for column in range(len(rows[0])) if len({row[column] for row in rows}) > 1]
         if len(varying) > 1:  # a counter beside a clock of seconds, which repeats itself
