@@ -68,13 +68,16 @@ def read_foreign(ply: PlyFile) -> tuple[GaussianSnapshot, dict[str, str]]:
     axis = re.search(r"(?:vertical|up)[ _]?axis\s*[:=]\s*\+?(-?[xyz])\b", text, re.IGNORECASE)
     if axis:
         metadata["up"] = axis[1].lower()
-    means = ply.columns(vertex, ["x", "y", "z"], np.float64)
-    offset = _offset(means)
-    if offset.any():
-        with np.errstate(over="ignore"):
-            values[:, :3] = means - offset
-        metadata["offset"] = json.dumps(offset.tolist())
-        _note(ply.path, f"lies far from the origin: {offset.tolist()} is taken off all coordinates")
+    middle, extent = _middle_and_extent(values[:, :3].astype(np.float64))
+    if np.abs(middle).max() > _FAR * extent:
+        means = ply.columns(vertex, ["x", "y", "z"], np.float64)  # in float32 they are terraces
+        middle, extent = _middle_and_extent(means)
+        if extent > 0:
+            offset = np.round(middle, max(0, -int(np.floor(np.log10(extent)))))
+            with np.errstate(over="ignore"):
+                values[:, :3] = means - offset
+            metadata["offset"] = json.dumps(offset.tolist())
+            _note(ply.path, f"lies far from the origin: {offset.tolist()} is taken off all coordinates")
     return snapshot_of(_mended(values, names, ply.path), names, ply.path), metadata
 
 
@@ -82,16 +85,13 @@ def _note(path: PathLike, text: str) -> None:
     print(f"note: {path}: {text}.", file=sys.stderr)
 
 
-def _offset(means: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What is taken off means (N, 3) where float32, in which they are terraces, would hold few digits of them: (3,)."""
+def _middle_and_extent(means: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Median (3,) of means (N, 3), and the longest side of the box around nine tenths of them; 0 of no finite ones."""
     finite = means[np.isfinite(means).all(axis=1)]
     if not len(finite):
-        return np.zeros(3)
+        return np.zeros(3), 0.0
     low, middle, high = np.quantile(finite, [0.05, 0.5, 0.95], axis=0)
-    extent = (high - low).max()  # of nine tenths
-    if extent == 0 or np.abs(middle).max() <= _FAR * extent:
-        return np.zeros(3)
-    return np.round(middle, max(0, -int(np.floor(np.log10(extent)))))
+    return middle, float((high - low).max())
 
 
 def _mended(values: Floats, names: list[str], path: PathLike) -> Floats:
