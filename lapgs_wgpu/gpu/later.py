@@ -17,15 +17,20 @@ from lapgs_wgpu.gpu.wgpu_errors import check_not_lost, translated_errors
 class Later:
     """Copies of some arrays, which commands make, and which `read` waits for once they were submitted.
 
-    The arrays' sizes are multiples of 4 bytes.
+    The arrays' sizes are multiples of 4 bytes. ring: buffers that earlier ones have read, and that are used again.
     """
 
-    def __init__(self, commands: Commands, arrays: Sequence[DeviceArray]) -> None:
+    def __init__(self, commands: Commands, arrays: Sequence[DeviceArray], ring: list[Any]) -> None:
         self._device, self._arrays, self._nbytes = commands.device, arrays, sum(array.nbytes for array in arrays)
-        with translated_errors(self._device, "what is read later", self._nbytes):
-            self._buffer = self._device.wgpu_device.create_buffer(
-                label="later", size=self._nbytes, usage=wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.COPY_DST
-            )
+        self._ring, large_enough = ring, [buffer for buffer in ring if buffer.size >= self._nbytes]
+        if large_enough:
+            self._buffer = large_enough[0]
+            ring.remove(self._buffer)
+        else:
+            with translated_errors(self._device, "what is read later", self._nbytes):
+                self._buffer = self._device.wgpu_device.create_buffer(
+                    label="later", size=self._nbytes, usage=wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.COPY_DST
+                )
         at = 0
         for array in arrays:
             commands.copy_out(array, self._buffer, at)
@@ -48,4 +53,5 @@ class Later:
                     values = content[at : at + array.nbytes].copy()
                     found.append(values.view(array.dtype).reshape(array.shape))
                     at += array.nbytes
+        self._ring.append(self._buffer)
         return found

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -54,6 +55,7 @@ class ResidentStep:
         self._passes = ResidentPasses(learners)
         self.parameters = self._passes.parameters
         self._flying: deque[Task] = deque()
+        self._ring: list[Any] = []
         self._statistics_on_host = True
         self.settled = 0
         scene.on_access, scene.on_device = self.to_host, self.at
@@ -143,7 +145,7 @@ class ResidentStep:
         task.counts = dict(self.parameters.steps)
         with Commands(self._scene.device, whole=True) as commands:
             task.drawing, told = self._passes.record(commands, task, truth)
-            task.later = Later(commands, told)
+            task.later = Later(commands, told, self._ring)
         task.later.submitted()
         return task
 
