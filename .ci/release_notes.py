@@ -3,8 +3,6 @@
 python .ci/release_notes.py v0.1.0
 """
 
-from __future__ import annotations
-
 import re
 import sys
 import tomllib

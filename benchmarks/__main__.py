@@ -1,7 +1,5 @@
 """Times the kernels on a fixed scene: `make bench`, or `python benchmarks --help`."""
 
-from __future__ import annotations
-
 # Before torch: it tells torch's threads how to wait, which is read once, when torch is imported.
 import lapgs_wgpu  # noqa: F401
 

@@ -5,8 +5,6 @@ that are off by 1 degree and 1 % of the cameras' extent, kept and refined. Error
 shift, a turn and a scaling of the whole scene explain does not count. Each SEED is a disturbance of its own.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import sys
 from pathlib import Path

@@ -4,8 +4,6 @@ Writes a capture in Neu3D's layout into a temporary folder (and the pictures tha
 pictures from it as a training does, at the pace of a fast device, or trains on it, and removes it all.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -1,8 +1,6 @@
 """What the device can do at most, measured by small kernels of our own beside what is timed: bytes copied,
 multiply-adds and powers of two in a second."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 Each RUN is a folder of lapgs-train whose capture is here. PSNR is the mean over its test views, of 8-bit pictures.
 """
 
-from __future__ import annotations
-
 import sys
 import tempfile
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Writing generated scenes in the D-NeRF layout: a folder that appears whole, and is reused by the same arguments."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The hash encoder at a preset's sizes, against its torch reference in the same run."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

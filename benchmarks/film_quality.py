@@ -5,8 +5,6 @@ lapgs-prepare --train does, with all schedules scaled to STEPS, in CAPTURES/runs
 outside the annotated masks.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import sys
 import time

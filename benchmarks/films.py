@@ -12,8 +12,6 @@ lapgs-prepare runs with a new HOME and nothing but its own programs on the PATH.
 the true ones after the best similarity, in parts of the cameras' spread.
 """
 
-from __future__ import annotations
-
 import resource
 import subprocess
 import sys

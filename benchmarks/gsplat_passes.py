@@ -2,8 +2,6 @@
 forward with backward, and each kernel by torch's profiler. Says so where there is no CUDA device or no gsplat.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import statistics

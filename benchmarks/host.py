@@ -4,8 +4,6 @@ Every dispatch has no workgroups. What is left is what the host does, and what t
 loop on the card as it is stands beside it.
 """
 
-from __future__ import annotations
-
 import itertools
 import time
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """All image losses and their gradient, against their torch references in the same run."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Wall-clock times, and what a call does to the device: dispatches, bytes moved, read-backs."""
 
-from __future__ import annotations
-
 import statistics
 import time
 from collections.abc import Callable, Iterator

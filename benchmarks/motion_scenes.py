@@ -6,8 +6,6 @@ all cameras, unless `objects` says otherwise, so their size depends on the path.
 a scene in the D-NeRF layout, with the true paths, masks and clean plates of the objects.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -7,8 +7,6 @@ masks/SPLIT/VIEW_OBJECT.png: pixels of a test image that show a moving object, 8
 clean/SPLIT/VIEW_OBJECT.png: the image without that object, RGBA.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import sys
 import tomllib

@@ -6,8 +6,6 @@ of the run's test views. Which pixels move follows from the images alone:
   small windows, since a fit is nowhere exact at edges.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -15,8 +15,6 @@ Pixels count within REACH diameters of the true mask, except those of other movi
 object that have the clean plate's color.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """The time of each pass, beside the least that the device's ceilings allow."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """The rasterizer: each pass by the device's own clock, the whole from outside."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -4,8 +4,6 @@ A renderer traces each surface on its own (`solid_hits`, `plane_hits`) and combi
 The same arguments give the same bytes on every machine.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ Each run has its own run folder, OUT/SCENE/ROW/seedN; OUT/results.json has the r
 command again skips what is finished and resumes the run that was interrupted. Exit code 1: a run failed.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json

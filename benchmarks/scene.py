@@ -1,8 +1,6 @@
 """The scenes that are timed, the same for every rasterizer that is compared: a ball of Gaussians, in the order in which
 a training keeps them, and what a training left in its checkpoint."""
 
-from __future__ import annotations
-
 import argparse
 import math
 import re
@@ -33,7 +31,7 @@ class SceneSize:
     height: int
 
     @staticmethod
-    def parse(name: str) -> SceneSize:
+    def parse(name: str) -> "SceneSize":
         found = re.fullmatch(r"(\d+)([kM]?)@(\d+)x(\d+)", name)
         if found is None:
             raise argparse.ArgumentTypeError(
@@ -65,7 +63,7 @@ class TrainedScene:
     height: int
 
     @staticmethod
-    def parse(name: str) -> TrainedScene:
+    def parse(name: str) -> "TrainedScene":
         found = re.fullmatch(r"(.+\.ply)@(\d+)x(\d+)", name)
         if found is None or not Path(found[1]).is_file():
             raise argparse.ArgumentTypeError(f"expected CHECKPOINT.ply@WIDTHxHEIGHT, and the file to exist: {name!r}")

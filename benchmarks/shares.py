@@ -1,7 +1,5 @@
 """Where a training step's time goes: the real loop with a preset, on the built-in scene."""
 
-from __future__ import annotations
-
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """A whole training step: the real loop, with the preset `tiny` on the built-in scene."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ Preset tiny without discovery, in the shape that graphics cards get, whatever th
 three seeds, dB. A run that OUT already has is not made again.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -7,8 +7,6 @@ found is known exactly. The scene fits in [-1.3, 1.3]^3, z is up, and the camera
 frame to frame.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Duration of each pass, from timestamps that the device writes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any

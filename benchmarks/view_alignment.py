@@ -4,8 +4,6 @@ Where training cameras are refined, the scene lies in their coordinates, and the
 those of the training views were. Methods that refine poses measure test views after such a fit (BARF, Lin et al. 2021).
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The viewer: from the command to the first picture, and pictures while the time slider is dragged, at 640x480."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

@@ -5,8 +5,6 @@ times are the medians of frames at new times, the page's in Chromium on SwiftSha
 first adapter: in the shape that the page uses, which is that for GPUs, and in the adapter's own.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import statistics
 import sys

@@ -6,8 +6,6 @@ store, whether it lies in a cache or not. An operation is what a lane does in on
 once, compare, choose, shuffle, divide. They were counted in the shaders' source; loops and addresses are left out.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import sqrt
@@ -30,7 +28,7 @@ class Work:
     operations: float = 0.0
     exponentials: float = 0.0
 
-    def __mul__(self, times: int) -> Work:
+    def __mul__(self, times: int) -> "Work":
         return Work(times * self.bytes, times * self.operations, times * self.exponentials)
 
 

@@ -4,8 +4,6 @@
 that Ctrl-C ended the command.
 """
 
-from __future__ import annotations
-
 import argparse
 import io
 import os

@@ -3,8 +3,6 @@
 It prints a Markdown line a check, whose name comes before it runs: a driver may crash or hang.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Iterator, Mapping

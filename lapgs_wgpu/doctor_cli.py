@@ -3,8 +3,6 @@
 The report is public: it names no users, hosts or folders.
 """
 
-from __future__ import annotations
-
 import os
 import platform
 import sys

@@ -1,7 +1,5 @@
 """The progress line of a long job, on stderr."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 import time
@@ -23,7 +21,7 @@ class Progress:
         self._shown = time.perf_counter()
         self._first: tuple[int, float] | None = None  # step, and when it was done: what comes before it may take long
 
-    def __enter__(self) -> Progress:
+    def __enter__(self) -> "Progress":
         return self
 
     def __exit__(self, *_: object) -> None:

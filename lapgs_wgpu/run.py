@@ -1,7 +1,5 @@
 """A run from start to end: a configuration and a capture become a trained scene in its run folder."""
 
-from __future__ import annotations
-
 import sys
 import threading
 import time

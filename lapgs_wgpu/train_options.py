@@ -1,7 +1,5 @@
 """The options of lapgs-train: a fixed part, and an option for each key of the configuration."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import textwrap

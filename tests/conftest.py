@@ -4,8 +4,6 @@ The tests marked `kernels` hold in each configuration, for example `LAPGS_TEST_D
 The Makefile says which configurations `make test` and `make test-all` run.
 """
 
-from __future__ import annotations
-
 # Before torch: it tells torch's threads how to wait, which is read once, when torch is imported.
 import lapgs_wgpu  # noqa: F401
 

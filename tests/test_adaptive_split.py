@@ -1,7 +1,5 @@
 """The adaptive split: neighbours, differences in shape and dynamics, and which candidates they let through."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Training from Python (docs/api.md): the trainer, its parts, and that they are what lapgs-train runs."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re

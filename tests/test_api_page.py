@@ -2,8 +2,6 @@
 
 The reference of the site is made from the docstrings (docs/tools/site.py)."""
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 import inspect

@@ -1,7 +1,5 @@
 """The benchmark itself, on a scene so small that its times mean nothing."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

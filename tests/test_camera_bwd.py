@@ -1,7 +1,5 @@
 """The gradient by the camera against finite differences of the float64 reference."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

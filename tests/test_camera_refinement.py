@@ -1,7 +1,5 @@
 """Cameras corrected while training: the corrections themselves, the step's gradient, and what they are for."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

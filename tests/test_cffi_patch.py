@@ -1,7 +1,5 @@
 """cffi's types by their text: quick look-ups find the same types."""
 
-from __future__ import annotations
-
 import re
 from importlib import resources
 from pathlib import Path

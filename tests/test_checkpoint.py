@@ -1,7 +1,5 @@
 """The checkpoint: its bytes, what it gives back, and what a hostile one cannot do."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """lapgs-train: what it makes, and each of its users' mistakes in one sentence with the right exit code."""
 
-from __future__ import annotations
-
 import io
 import json
 import shlex

@@ -1,7 +1,5 @@
 """Colors seen through `rasterize`: splats far apart, of which each fills the middle of its own square of pixels."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Compact scenes: what a file keeps of a checkpoint, and what is refused."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """All shaders, in every shape in which they are composed, in two compilers: naga (wgpu) and Tint (Chromium)."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator

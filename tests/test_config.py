@@ -1,7 +1,5 @@
 """Presets and overrides: values, round trip, and one clear sentence for each mistake."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What Gaussians contribute to images, and that those are pruned which nobody would miss."""
 
-from __future__ import annotations
-
 import dataclasses
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """How much a training step asks of the device: dispatches, read-backs, bytes that cross over."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """The D-NeRF reader: geometry, intrinsics, transparency and validation views. See also test_data_refusals.py."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Initial points and scales."""
 
-from __future__ import annotations
-
 import dataclasses
 from itertools import product
 

@@ -1,7 +1,5 @@
 """The pipeline from a reader's frames to a dataset: what every format gets without any code of its own."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

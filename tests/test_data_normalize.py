@@ -1,7 +1,5 @@
 """Scenes in D-NeRF's layout of any size and place: which keep their coordinates, and where others are brought."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Captures that contradict themselves, or lie far from their origin: read right, or told."""
 
-from __future__ import annotations
-
 import json
 import struct
 import zlib

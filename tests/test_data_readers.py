@@ -1,7 +1,5 @@
 """Every reader: what its cameras see is what the images show, its times, its splits and its cloud are those written."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """What is wrong with a capture's files is refused in one line that names the file and the field."""
 
-from __future__ import annotations
-
 import json
 import math
 import struct

@@ -1,7 +1,5 @@
 """The built-in scene: known motion, rendered where it should be, written whole or not at all."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from pathlib import Path

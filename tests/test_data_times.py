@@ -1,7 +1,5 @@
 """How captures of own footage are understood: layouts, names, times, and what is left out."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """What goes wrong with captures of one's own is told before the training; and how times and splits are found."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Neu3D's recordings: their order, and the frames of videos, which are unpacked once, upright and within bounds."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 from fractions import Fraction

@@ -1,7 +1,5 @@
 """Views, compositing and the image cache."""
 
-from __future__ import annotations
-
 import dataclasses
 import threading
 from collections import Counter

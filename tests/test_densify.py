@@ -1,7 +1,5 @@
 """Density control: statistics in the right units, who is cloned, split and removed, and what children inherit."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

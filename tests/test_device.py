@@ -1,7 +1,5 @@
 """Choosing an adapter and opening it."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

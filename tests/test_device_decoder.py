@@ -1,7 +1,5 @@
 """The passes of the decoder on the device and of the smoothness loss, against torch."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

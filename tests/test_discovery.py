@@ -1,7 +1,5 @@
 """Discovery: what a static fit loses is found in space and time, followed, and given to the field."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 """The documents: links and anchors lead somewhere, commands are understood by their programs, options that prose names
 exist, and Python runs as it stands."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

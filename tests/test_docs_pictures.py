@@ -1,7 +1,5 @@
 """The pictures of docs/how-it-works.md that show what the passes leave (docs/tools/passes.py)."""
 
-from __future__ import annotations
-
 import itertools
 import runpy
 from pathlib import Path

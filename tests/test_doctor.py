@@ -1,7 +1,5 @@
 """lapgs-doctor: its checks pass, each sees a broken kernel, and the report gets written."""
 
-from __future__ import annotations
-
 import getpass
 import os
 import socket

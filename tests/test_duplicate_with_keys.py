@@ -1,7 +1,5 @@
 """Which tiles each splat is listed in: every one with a pixel that it reaches, hardly any other, and all counted."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

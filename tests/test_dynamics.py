@@ -1,7 +1,5 @@
 """The dynamics attribute: who stands out, and what the loss and its gradient are, against hand computations."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """The evaluation: 8-bit pictures on both sides, means over views, pictures of each view."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

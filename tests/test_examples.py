@@ -1,7 +1,5 @@
 """The programs in examples/, in the smallest size."""
 
-from __future__ import annotations
-
 import runpy
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Straight pieces of motion in a .4dgs file, read back by the reference implementation of the format."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Exports say what they lost, and of which Gaussians."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

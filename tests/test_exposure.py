@@ -1,7 +1,5 @@
 """Exposure: the passes against their reference, the corrections, and what they are for."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -1,7 +1,5 @@
 """The fields behind one interface: what each adds, what its ablations take away, and the smoothness losses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

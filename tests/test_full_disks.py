@@ -4,8 +4,6 @@ Errors are injected at the operations of a run, and of the viewer, that change t
 every operation with every error; the nightly suite takes one error an operation, in turn.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import errno
 import os

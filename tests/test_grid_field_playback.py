@@ -1,7 +1,5 @@
 """Grid fields on the device against the formula of Scene4D in float64 torch."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

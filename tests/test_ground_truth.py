@@ -1,7 +1,5 @@
 """The images that a training compares with: which are kept, how they are laid and marked, and their order."""
 
-from __future__ import annotations
-
 import dataclasses
 from contextlib import closing
 

@@ -1,7 +1,5 @@
 """The hash encoder's kernels against its torch reference."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

@@ -1,7 +1,5 @@
 """What a training asks of its host: threads of torch in a step; blocks of freed memory that are not cleared again."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import platform

@@ -3,8 +3,6 @@
 See test_hostile_files.py, which does the same to the other formats.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -4,8 +4,6 @@ A few hundred inputs a format, always the same; LAPGS_FUZZ=10000 takes as many n
 far stands in test_hostile_found.py as plain tests; captures are in test_hostile_captures.py.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import json

@@ -1,7 +1,5 @@
 """Hostile files: the faults that fuzzing and reading found, links and pipes, and the bounds on memory and time."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

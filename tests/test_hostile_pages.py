@@ -3,8 +3,6 @@
 A few hundred files, always the same; LAPGS_FUZZ=10000 takes as many new ones (make soak).
 """
 
-from __future__ import annotations
-
 import base64
 import struct
 import zlib

@@ -1,7 +1,5 @@
 """Masks of a user's own in the training: what they cover has no influence."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

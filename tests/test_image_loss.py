@@ -1,7 +1,5 @@
 """The kernels of the image losses against their references in float64, and a step that reads back losses alone."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

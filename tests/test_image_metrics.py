@@ -1,7 +1,5 @@
 """Measures of images, each against its definition in float64."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """What may import what: gpu <- splat <- motion <- train <- cli, with data and io as leaves; and what `import` does."""
 
-from __future__ import annotations
-
 import ast
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """Buffers, and kernels that take them by name."""
 
-from __future__ import annotations
-
 import struct
 import threading
 from typing import Any

@@ -1,7 +1,5 @@
 """The Laplacian motion module: its series, eq. 5's gradient of the frequencies, and how they are moved."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Files that desktops keep beside others."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The image losses of the reference: each against its definition in float64, and their sum."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

@@ -1,7 +1,5 @@
 """Products of matrices on the device against torch in float64."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """The order of Gaussians along a Morton curve."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """The scenes of benchmarks/motion_scenes, and the measures of what moves in them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The acceleration loss: where it looks, its value and gradients, and what a training makes of it."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Movers that masks show: cut-outs that are followed, and the cube in which things move."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

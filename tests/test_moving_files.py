@@ -1,7 +1,5 @@
 """Moving scenes in files of other programs are written and read back, by a foreign reader where there is one."""
 
-from __future__ import annotations
-
 import json
 import struct
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Values that are not finite: named in the step in which they appear, kept from what lasts, and a reason to stop."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from contextlib import closing

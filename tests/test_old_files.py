@@ -3,8 +3,6 @@
 old_checkpoint.npz holds the Gaussians that the code of that commit computed from its checkpoint at two times.
 """
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The optimizer: schedules, and Adam's state while Gaussians come and go."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor, nn

@@ -1,7 +1,5 @@
 """The training that lapgs-prepare --train chooses: from the adapter, the capture, the time, and a measured step."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Surfaces of what stands still, by a plane sweep between still cameras."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

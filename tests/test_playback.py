@@ -1,7 +1,5 @@
 """Opening a scene to show it: the pictures are those of Scene4D, and torch stays outside where it can."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The .ply reader and writer: the layout byte for byte, other programs' variants, and files that lie."""
 
-from __future__ import annotations
-
 import errno
 import os
 import stat

@@ -1,7 +1,5 @@
 """Variants of .ply files that other programs write: each is shown as it is meant, or refused with the reason."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

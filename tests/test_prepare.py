@@ -1,7 +1,5 @@
 """lapgs-prepare: from films to captures that open, and what it says of films that are of no use."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

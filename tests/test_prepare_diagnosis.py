@@ -1,7 +1,5 @@
 """What lapgs-prepare --check says of captures: each measure of one that has the fault and of one that has not."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import re

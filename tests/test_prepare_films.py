@@ -1,7 +1,5 @@
 """Films as phones and cameras record them, and the images that are taken of them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace

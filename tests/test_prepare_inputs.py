@@ -1,7 +1,5 @@
 """Inputs of lapgs-prepare as people have them: images, zip files, calibrations, and poses of other programs."""
 
-from __future__ import annotations
-
 import json
 import re
 import zipfile

@@ -1,7 +1,5 @@
 """Masks of what moves: cameras that follow the room though a board fills much of the film, and a user's own masks."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Cameras of films: pans by their rotations, the path of a hand, and the part of a film that fits together."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from types import SimpleNamespace

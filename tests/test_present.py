@@ -1,7 +1,5 @@
 """Pictures on a target: each thing that the shader shows, against the same in numpy."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

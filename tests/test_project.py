@@ -1,7 +1,5 @@
 """The projection pass against its float64 reference."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re

@@ -2,8 +2,6 @@
 """The presets of single scenes against the settings that Grid4D (Xu et al. 2024) published for each, in the units of
 their captures; and D-NeRF's."""
 
-from __future__ import annotations
-
 import dataclasses
 from types import SimpleNamespace
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Columns of numbers as whole numbers and outliers, and back."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The radix sort, in both shapes, against numpy's stable sort."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

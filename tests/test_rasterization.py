@@ -1,7 +1,5 @@
 """gsplat's call against the float64 reference of `rasterize`, in the combinations that gsplat's own trainer uses."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

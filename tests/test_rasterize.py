@@ -1,7 +1,5 @@
 """The whole rasterizer, forward and backward, against its float64 reference."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """The same step gives the same bits: again, after other steps, at any capacity, with anything left in the buffers."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

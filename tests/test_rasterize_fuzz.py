@@ -1,7 +1,5 @@
 """Bad, extreme and missing input never crashes, never spreads, and nothing depends on what the buffers held before."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

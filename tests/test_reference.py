@@ -1,7 +1,5 @@
 """The float64 oracle against hand-computed pixels, a literal loop, finite differences, and textbook formulas."""
 
-from __future__ import annotations
-
 import math
 from importlib.resources import files
 from typing import Any

@@ -1,7 +1,5 @@
 """The notes of a release: tag, version and changelog must agree (.ci/release_notes.py)."""
 
-from __future__ import annotations
-
 import runpy
 import tomllib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The passes of the resident step that no gradient test covers, each against torch in float64."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

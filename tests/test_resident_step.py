@@ -1,7 +1,5 @@
 """The step that stays on the device, against the one by torch; and what it does where something goes wrong."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import os

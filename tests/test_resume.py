@@ -1,7 +1,5 @@
 """Interrupted and killed trainings go on to the same bytes; what was saved survives; two writers are kept apart."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os

@@ -1,7 +1,5 @@
 """benchmarks/run_table: what a spec asks for, which runs it trains, and the table of their results."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

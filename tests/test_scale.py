@@ -4,8 +4,6 @@ Mesa's software driver ends a shader without a word when all loops of an invocat
 What is large runs with LAPGS_SOAK=1 alone (`make soak`).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import os
 from collections.abc import Callable

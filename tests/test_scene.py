@@ -1,7 +1,5 @@
 """The moving scene: its formula, its pictures, and the way to a file and back."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

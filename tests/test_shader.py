@@ -1,7 +1,5 @@
 """Composing WGSL, reading its bindings, packing its structs: no device needed."""
 
-from __future__ import annotations
-
 import re
 import struct
 from importlib.resources import files

@@ -1,7 +1,5 @@
 """Where each tile's list begins and ends."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

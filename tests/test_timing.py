@@ -1,7 +1,5 @@
 """The timing of a capture: its moments, its text, and what scenes and playback make of it."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Times of training images that are corrected while training."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 

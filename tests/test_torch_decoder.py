@@ -1,7 +1,5 @@
 """The decoder without hidden layers in torch: against autograd of the same in float64, and in blocks."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest

@@ -1,7 +1,5 @@
 """The training from end to end, in the smallest size: it learns, it repeats to the last byte, it leaves a whole run."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import json

@@ -1,7 +1,5 @@
 """The viewer's camera: what mouse moves leave as it was, and standing at a capture's camera."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -1,7 +1,5 @@
 """The viewer's clock: where the clip goes on at its ends, whole frames, speeds."""
 
-from __future__ import annotations
-
 import pytest
 
 from lapgs_wgpu.viewer.clock import Clock

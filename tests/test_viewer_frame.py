@@ -1,7 +1,5 @@
 """Frames: in full at rest, whatever was drawn while something moved; devices that fail."""
 
-from __future__ import annotations
-
 import asyncio
 import importlib
 import signal

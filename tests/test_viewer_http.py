@@ -1,7 +1,5 @@
 """The viewer in a browser: who may come in, and, in headless Chromium, that it shows what the desktop draws."""
 
-from __future__ import annotations
-
 import asyncio
 import re
 import signal

@@ -1,7 +1,5 @@
 """lapgs-view without a screen: pictures equal the evaluator's, videos and stills read back, mistakes are told."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """The desktop window, on a virtual screen, driven by real mouse and key events."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import signal

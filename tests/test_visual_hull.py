@@ -1,7 +1,5 @@
 """What moves between still cameras all around: its places and its colors."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

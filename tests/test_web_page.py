@@ -1,7 +1,5 @@
 """The exported page as a file: what it holds, and that it asks for nothing from elsewhere."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

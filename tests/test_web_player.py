@@ -3,8 +3,6 @@
 On every push the two must agree; the rest runs every night.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import struct

@@ -1,7 +1,5 @@
 """A device that runs out of memory or is lost: one sentence, an exit code, and a state from which the run goes on."""
 
-from __future__ import annotations
-
 import re
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The interactive viewer: puts state, viewport, controls and panels together. It draws only what has changed."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import Any

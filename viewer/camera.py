@@ -1,7 +1,5 @@
 """The camera that the mouse and the keys move, and how it becomes the rasterizer's."""
 
-from __future__ import annotations
-
 import math
 from contextlib import suppress
 

@@ -1,7 +1,5 @@
 """Time in the clip while it plays."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Literal

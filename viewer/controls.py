@@ -1,7 +1,5 @@
 """Mouse and keyboard: what is handled, and what the help shows."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple

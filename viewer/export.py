@@ -1,7 +1,5 @@
 """Files for other viewers: stills as plain .ply in Inria's layout, one or a sequence; a compact scene; a web page."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

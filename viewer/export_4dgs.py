@@ -1,7 +1,5 @@
 """Export to `.4dgs`: the motion as straight pieces, written by the format's own library."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What an export loses: pictures of what was written against those of the scene that it was made of."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

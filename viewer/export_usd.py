@@ -1,7 +1,5 @@
 """Export to OpenUSD, through usd-core: a ParticleField3DGaussianSplat (OpenUSD 26.03) with time samples."""
 
-from __future__ import annotations
-
 import math
 import shutil
 import tempfile

@@ -1,7 +1,5 @@
 """Draws a frame: the scene at a time, seen by a camera, as its colors or as one of its values."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from typing import NamedTuple

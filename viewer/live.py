@@ -5,8 +5,6 @@ and keys in between. A picture of the new state is drawn seldom enough to cost t
 or the time moves, when the pictures come first.
 """
 
-from __future__ import annotations
-
 import signal
 import sys
 import time

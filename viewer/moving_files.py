@@ -1,7 +1,5 @@
 """Moving scenes in files of others, played: .ply sequences, Spacetime Gaussians (.ply, .splatv), .4dgs, OpenUSD."""
 
-from __future__ import annotations
-
 import json
 import struct
 import sys

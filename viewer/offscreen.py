@@ -1,7 +1,5 @@
 """Renders without a window: screenshots and the frames of videos."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

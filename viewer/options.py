@@ -1,7 +1,5 @@
 """The options of lapgs-view, and which of them go together."""
 
-from __future__ import annotations
-
 import argparse
 import re
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """The GUI over the image (Dear ImGui): the view's panel, overlay, help."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, TypeVar

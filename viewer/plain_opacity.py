@@ -1,7 +1,5 @@
 """Opacities for players that draw without antialiasing."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

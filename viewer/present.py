@@ -1,7 +1,5 @@
 """The pass `present`: draws a frame onto a window's texture, or one of our own, without a host copy."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -4,8 +4,6 @@ Any user of this machine, and any page in a browser on it, can reach the server.
 token that is made anew each time: who does not know it gets no page and no websocket.
 """
 
-from __future__ import annotations
-
 import asyncio
 import errno
 import html

@@ -1,7 +1,5 @@
 """Render modes, backgrounds and vertical axes: constants that load neither torch nor wgpu."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 Mode = Literal["rgb", "depth", "alpha", "motion"]

@@ -1,7 +1,5 @@
 """Write videos (H.264 in MP4), and the cameras of their frames."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from fractions import Fraction

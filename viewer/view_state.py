@@ -1,7 +1,5 @@
 """What the viewer shows: scene, camera, time, mode. Its methods are actions of keys and panels."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

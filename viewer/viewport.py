@@ -1,7 +1,5 @@
 """The canvas's frames: drawn where something changed, at the resolution that keeps up."""
 
-from __future__ import annotations
-
 import math
 import time
 from typing import Any

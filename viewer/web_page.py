@@ -1,7 +1,5 @@
 """The scene as a web page: one file with the player (viewer/web), its shaders as data, the scene and a poster."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import html

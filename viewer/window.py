@@ -1,7 +1,5 @@
 """The desktop window, by glfw."""
 
-from __future__ import annotations
-
 import os
 import sys
 import warnings

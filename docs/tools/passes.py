@@ -1,7 +1,5 @@
 """The pictures of docs/how-it-works.md: what the passes and discovery leave, of a run of the built-in scene."""
 
-from __future__ import annotations
-
 import colorsys
 from collections.abc import Sequence
 from dataclasses import replace

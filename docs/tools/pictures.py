@@ -3,8 +3,6 @@
 python docs/tools/pictures.py RUN DIR
 """
 
-from __future__ import annotations
-
 import io
 import math
 import sys

@@ -3,8 +3,6 @@
 MkDocs calls the functions below by their names.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

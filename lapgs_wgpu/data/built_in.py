@@ -1,7 +1,5 @@
 """The built-in moving scene: toys over a checkered table, in the D-NeRF layout; benchmarks/synthetic.py renders it."""
 
-from __future__ import annotations
-
 from importlib import resources
 from pathlib import Path
 from zipfile import ZipFile

@@ -1,7 +1,5 @@
 """Files that a capture names: found also as another system writes their names, and left out where they are absent."""
 
-from __future__ import annotations
-
 import os
 import re
 import unicodedata

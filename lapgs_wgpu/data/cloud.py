@@ -1,7 +1,5 @@
 """The point cloud of a capture, at which Gaussians start, and which cameras see its points."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,11 +28,11 @@ class Cloud(NamedTuple):
     colors: NDArray[np.float32]
 
     @property
-    def rounded(self) -> Cloud:
+    def rounded(self) -> "Cloud":
         """The same cloud with float32 points."""
         return Cloud(self.points.astype(np.float32), self.colors)
 
-    def at_most(self, count: int, seed: int) -> Cloud:
+    def at_most(self, count: int, seed: int) -> "Cloud":
         """Return at most `count` points: all of them, or a random subset in their order."""
         if len(self.points) <= count:
             return self

@@ -1,7 +1,5 @@
 """Some of many: evenly chosen items, the first names of a list."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import TypeVar
 

@@ -1,7 +1,5 @@
 """What the cameras of a capture look at, and how far apart they stand."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

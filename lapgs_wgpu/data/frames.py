@@ -3,8 +3,6 @@
 `load` does everything else: it undistorts, normalizes, splits and validates.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path

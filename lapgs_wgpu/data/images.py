@@ -4,8 +4,6 @@ imageio decodes and encodes. Pillow, on which imageio's plugin is built, does wh
 without decoding the image, verify checksums, restrict the formats, decode a JPEG at a fraction of its size, resample.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import struct
@@ -84,7 +82,7 @@ class ImageFile(NamedTuple):
         return shrink(image, size)
 
     @property
-    def turned(self) -> ImageFile:
+    def turned(self) -> "ImageFile":
         """The same file, read as its orientation says."""
         size = self.size[::-1] if self.orientation >= SIDEWAYS else self.size
         return self._replace(size=size, upright=True)

@@ -1,7 +1,5 @@
 """Initial Gaussians: means from the capture's cloud or random ones, and scales from the distances between them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

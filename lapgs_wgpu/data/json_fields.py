@@ -1,7 +1,5 @@
 """Read fields of untrusted JSON files. Each error names the file, the field, and the value found."""
 
-from __future__ import annotations
-
 import math
 import sys
 from dataclasses import dataclass
@@ -55,7 +53,7 @@ class Fields:
             raise InputError(f"{self.where}: {name} must be a list of {needed}, got {shown(value)}.")
         return value
 
-    def objects(self, name: str, what: str) -> list[Fields]:
+    def objects(self, name: str, what: str) -> "list[Fields]":
         """Return a list of objects. what: an entry, for errors. Raises InputError."""
         return [as_fields(value, f"{self.where}, {what} {i}") for i, value in enumerate(self.entries(name))]
 

@@ -3,8 +3,6 @@
 The lens model is that of nerfies and of Brown (1966): three radial and two tangential coefficients, and a skew.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -54,11 +52,11 @@ class Lens:
         return not (any(self.radial) or any(self.tangential) or self.skew)
 
     @property
-    def idealized(self) -> Lens:
+    def idealized(self) -> "Lens":
         """A pinhole of the same focal lengths that looks at the image's center, as much published code takes it."""
         return Lens(self.width, self.height, self.fx, self.fy, self.width / 2, self.height / 2)
 
-    def resized(self, width: int, height: int) -> Lens:
+    def resized(self, width: int, height: int) -> "Lens":
         """The same lens for images of another size."""
         x, y = width / self.width, height / self.height
         return Lens(

@@ -4,8 +4,6 @@ A reader knows its file format and nothing else; whatever holds for all formats 
 file in `readers` and a line in READERS.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial

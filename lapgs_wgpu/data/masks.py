@@ -4,8 +4,6 @@ They say which pixels of training images the loss ignores, white in masks of a u
 capture names itself (nerfstudio's `mask_path`); or what moves, white.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Literal

@@ -3,8 +3,6 @@
 The cube is that of D-NeRF's scenes, which keep their coordinates. Captures are never rotated.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -47,7 +45,7 @@ class Normalization(NamedTuple):
         near = self.scale * camera.near
         return Camera(camera.K, self.pose(camera.T_cam_world), camera.width, camera.height, near)
 
-    def then(self, other: Normalization) -> Normalization:
+    def then(self, other: "Normalization") -> "Normalization":
         """Compose: this one first, then the other."""
         return Normalization(self.center + other.center / self.scale, self.scale * other.scale)
 

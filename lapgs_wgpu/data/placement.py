@@ -1,8 +1,6 @@
 """Where the scene of a capture lies: its depths before the cameras, its cube, or that of what moves, from masks and a
 cloud of what stands still; and a cloud that is filled up."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

@@ -8,8 +8,6 @@ color. Sources: Collins, A space-sweep approach to true multi-image matching (CV
 using optimization (SIGGRAPH 2004).
 """
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, partial
 from typing import NamedTuple

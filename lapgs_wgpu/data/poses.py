@@ -1,7 +1,5 @@
 """Check the poses of capture files and convert them to OpenCV's axes."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

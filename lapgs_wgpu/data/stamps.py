@@ -1,7 +1,5 @@
 """What the names of images say: which camera took each, and the clock times and seconds in them."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence

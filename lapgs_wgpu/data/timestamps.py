@@ -1,7 +1,5 @@
 """Timestamps of own footage, from times.json or from the names of images, and what is held out (docs/own-data.md)."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Validate a capture before training: what prevents it raises InputError, other problems are warnings."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path

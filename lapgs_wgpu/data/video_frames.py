@@ -2,8 +2,6 @@
 decoding a frame in the middle of a clip takes seconds (docs/notes/captures.md).
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Iterator
@@ -54,7 +52,7 @@ def frames_folder(path: Path, size: Size) -> Path:
     return caches / "frames" / _place(path.parent) / name
 
 
-def _check_header(path: Path) -> tuple[Display, Size]:
+def _check_header(path: Path) -> "tuple[Display, Size]":
     """Check the header and decode the first frame: how it is shown, and the (width, height) as shown.
 
     Raises InputError for what is no film, and for frames that are too large, or not of square pixels.
@@ -74,7 +72,7 @@ def _check_header(path: Path) -> tuple[Display, Size]:
     return shape, shape.size((first.width, first.height))
 
 
-def _unpack(path: Path, folder: Path, shape: Display, size: Size, wanted: Size) -> None:
+def _unpack(path: Path, folder: Path, shape: "Display", size: Size, wanted: Size) -> None:
     """Write every frame, of (width, height) `size`, as PNG of the wanted size into a new folder. Raises InputError."""
     print(f"{path}: its frames are unpacked once, into {folder}", file=sys.stderr, flush=True)
     written, declared = list[Future[None]](), 0

@@ -1,7 +1,5 @@
 """Datasets: views with lazily decoded 8-bit images."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 from collections import Counter

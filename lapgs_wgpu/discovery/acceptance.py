@@ -4,8 +4,6 @@ A part must show where something moves, or, where several cameras see each time,
 images. Patches of what the static fit only blurs do neither, though they can be followed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

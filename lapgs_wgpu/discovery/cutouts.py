@@ -6,8 +6,6 @@ longer looks alike. It stands upright at the depth of the ground below it. Each 
 images alone.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

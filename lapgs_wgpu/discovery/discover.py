@@ -1,7 +1,5 @@
 """The start of a training: what stands still, and the things that move, which a fit of it loses; then a Trainer."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Mapping

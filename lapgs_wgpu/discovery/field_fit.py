@@ -1,7 +1,5 @@
 """A deformation field fitted to tracks, before any image is looked at."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 import numpy as np

@@ -5,8 +5,6 @@ around both finds the translation that explains most points; and a registration 
 (Myronenko and Song 2010), stiff within a part, bends it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Where a training image differs from the static fit, and what a point in space looks like there."""
 
-from __future__ import annotations
-
 from functools import cached_property
 from typing import Any
 

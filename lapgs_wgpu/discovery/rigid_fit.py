@@ -4,8 +4,6 @@ A body starts as a ball of Gaussians that turns as `turns` found. Steps of Adam 
 Gaussians, the light, and smooth corrections of its turn and shift at all times.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

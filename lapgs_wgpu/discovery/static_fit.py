@@ -1,7 +1,5 @@
 """A fit of what stands still: a short training without motion, of small images."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple

@@ -6,8 +6,6 @@ the ray, until the middle of the scene is as good a place as any. Places that di
 static fit blurs. They get no points.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -45,11 +43,11 @@ class Points(NamedTuple):
     colors: Floats
     scores: Floats
 
-    def chosen(self, rows: NDArray[Any]) -> Points:
+    def chosen(self, rows: NDArray[Any]) -> "Points":
         """The points of an index or a mask (n,)."""
         return Points(*(values[rows] for values in self))
 
-    def thinned(self, most: int) -> Points:
+    def thinned(self, most: int) -> "Points":
         """At most `most` of the points, evenly chosen."""
         return self.chosen(evenly_indices(len(self.scores), most))
 

@@ -4,8 +4,6 @@ Points of a key time, at which things are apart, form parts. Each part is follow
 (`follower`). What no track explains forms the parts of the next key time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -65,7 +63,7 @@ class Tracks(NamedTuple):
         """(T, 3) the mean of the points of part k."""
         return self.paths[:, self.part == k].mean(axis=1)
 
-    def of_parts(self, kept: NDArray[np.bool_]) -> Tracks | None:
+    def of_parts(self, kept: NDArray[np.bool_]) -> "Tracks | None":
         """The tracks of the parts (p,) that are set, and numbered anew; None where there are none."""
         chosen = kept[self.part]
         if not chosen.any():
@@ -73,7 +71,7 @@ class Tracks(NamedTuple):
         part = np.unique(self.part[chosen], return_inverse=True)[1].ravel()
         return self.rows(chosen)._replace(part=part)
 
-    def rows(self, chosen: NDArray[np.bool_]) -> Tracks:
+    def rows(self, chosen: NDArray[np.bool_]) -> "Tracks":
         """The tracks (n,) that are set, with the numbers of their parts."""
         of_time = self.paths[:, chosen], self.supported[:, chosen]
         return Tracks(self.positions[chosen], self.colors[chosen], self.part[chosen], *of_time)

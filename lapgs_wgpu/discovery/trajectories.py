@@ -10,8 +10,6 @@ usually are groups are given the groups of each time at once, one to one, and pa
 they bend least; so do all across a gap between the images, in which things may have gone anywhere.
 """
 
-from __future__ import annotations
-
 from itertools import combinations
 from typing import NamedTuple
 

@@ -6,8 +6,6 @@ there outwards, each time turns as its image fits best what is known of the ball
 then each is fitted once more to what all others show. `rigid_fit` makes it exact.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 

@@ -4,8 +4,6 @@ Something is at a place if nearly all cameras that see the place, AROUND or more
 Laurentini, The visual hull concept for silhouette-based image understanding (PAMI 1994).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage

@@ -1,7 +1,5 @@
 """Arrays on the device: a part of a buffer with a dtype and a shape."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -37,12 +35,12 @@ class DeviceArray:
         object.__setattr__(self, "bound_bytes", max(16, (nbytes + 15) & ~15))
 
     @staticmethod
-    def empty(device: Device, label: str, shape: tuple[int, ...], dtype: str = "float32") -> DeviceArray:
+    def empty(device: Device, label: str, shape: tuple[int, ...], dtype: str = "float32") -> "DeviceArray":
         """Return an array of zeros in a buffer of its own."""
         return DeviceArray(Buffer(device, math.prod(shape) * _ITEM_BYTES[dtype], label), shape, dtype)
 
     @staticmethod
-    def upload(device: Device, label: str, values: NDArray[Any]) -> DeviceArray:
+    def upload(device: Device, label: str, values: NDArray[Any]) -> "DeviceArray":
         """Return a copy of `values`, with their shape and dtype, in a buffer of its own."""
         array = DeviceArray.empty(device, label, values.shape, values.dtype.name)
         array.write(values)
@@ -63,7 +61,7 @@ class DeviceArray:
         """The resource that wgpu binds."""
         return {"buffer": self.buffer.wgpu_buffer, "offset": self.offset, "size": self.bound_bytes}
 
-    def rows(self, first: int, count: int) -> DeviceArray:
+    def rows(self, first: int, count: int) -> "DeviceArray":
         """Rows first to first + count; to be bound, they must begin at a multiple of 256 bytes."""
         row = math.prod(self.shape[1:])
         return DeviceArray(

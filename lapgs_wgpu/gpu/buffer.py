@@ -1,7 +1,5 @@
 """Buffers on the device, their uploads, and the textures made from them."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 from dataclasses import dataclass

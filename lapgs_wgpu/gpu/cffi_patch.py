@@ -5,8 +5,6 @@ names are looked up until the first kernel has run, 90 until a window shows some
 in the text are declared before it. It uses cffi's internals; if these differ, nothing is changed.
 """
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

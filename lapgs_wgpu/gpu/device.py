@@ -1,7 +1,5 @@
 """Graphics adapters and opened devices."""
 
-from __future__ import annotations
-
 import ctypes.util
 import functools
 import os

@@ -1,7 +1,5 @@
 """Compute kernels, whose arrays are bound by name, and lists of commands that run them."""
 
-from __future__ import annotations
-
 import re
 import weakref
 from collections.abc import Iterator, Mapping
@@ -41,7 +39,7 @@ class Kernel:
         self.written = [name for name, binding in self.bindings.items() if binding.kind == "read_write"]
 
     @staticmethod
-    def get(device: Device, name: str, **defines: int) -> Kernel:
+    def get(device: Device, name: str, **defines: int) -> "Kernel":
         """Return the kernel with these defines (`shader.enabled`), compiled once per device."""
         defines = enabled(defines)
         if device.textures:
@@ -173,7 +171,7 @@ class Commands:
             self.device.queue.submit([encoder.finish()])
         self._list = []
 
-    def __enter__(self) -> Commands:
+    def __enter__(self) -> "Commands":
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, at: object) -> None:

@@ -1,7 +1,5 @@
 """Small results that are read some time after they were submitted, without a wait for what was submitted since."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Matrix products on the device, and sums of columns."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 from lapgs_wgpu.gpu.array import DeviceArray
@@ -28,17 +26,17 @@ class Matrix:
     transposed: bool = False
 
     @staticmethod
-    def of(array: DeviceArray) -> Matrix:
+    def of(array: DeviceArray) -> "Matrix":
         """Return a whole array (rows, columns)."""
         rows, columns = array.shape
         return Matrix(array, rows, columns, columns)
 
     @property
-    def transpose(self) -> Matrix:
+    def transpose(self) -> "Matrix":
         """The same memory with rows and columns exchanged."""
         return replace(self, rows=self.columns, columns=self.rows, transposed=not self.transposed)
 
-    def from_column(self, first: int, count: int) -> Matrix:
+    def from_column(self, first: int, count: int) -> "Matrix":
         """`count` columns from column `first` on; the matrix must not be transposed."""
         return replace(self, first=self.first + first, columns=count)
 

@@ -4,8 +4,6 @@ wgpu-py takes some 20 microseconds for each such call, and maps buffers by way o
 wgpu-py's own, which keep them alive; errors are raised as wgpu-py raises them.
 """
 
-from __future__ import annotations
-
 import itertools
 import time
 from collections.abc import Iterable, Iterator

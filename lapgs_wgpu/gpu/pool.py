@@ -1,7 +1,5 @@
 """Buffers that a module reuses from call to call."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Stable radix sort on the device. The number of elements is read on the device."""
 
-from __future__ import annotations
-
 import struct
 
 from lapgs_wgpu.gpu.array import DeviceArray

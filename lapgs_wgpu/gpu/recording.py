@@ -1,7 +1,5 @@
 """Commands that are recorded once and submitted again: a dispatch then takes its host a few microseconds."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Exclusive scan on the device. The number of elements is read on the device."""
 
-from __future__ import annotations
-
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel

@@ -13,8 +13,6 @@ processors, Mesa's software driver reads a texel of four words ten times faster 
 (docs/notes/speed.md).
 """
 
-from __future__ import annotations
-
 import functools
 import re
 import struct

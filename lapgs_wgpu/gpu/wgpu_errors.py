@@ -6,8 +6,6 @@ Hence commands are finished right before their submission, where a lost device r
 checked before buffers are created.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 

@@ -1,7 +1,5 @@
 """Write files atomically: a failed write leaves the previous file unchanged."""
 
-from __future__ import annotations
-
 import os
 import secrets
 import shutil

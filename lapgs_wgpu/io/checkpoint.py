@@ -4,8 +4,6 @@ The element `lapgs4d` follows the Gaussians of a 3DGS .ply; its rows of one uint
 (docs/format.md). Equal models give equal bytes; nothing in the file is executed.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Dataclasses from parsed TOML and JSON: the one place that checks keys, types and ranges."""
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 import operator

@@ -1,7 +1,5 @@
 """A lock on a folder, so that one process writes to it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The initial view of the viewer, stored in the metadata of a checkpoint (docs/format.md, key `view`)."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from contextlib import suppress
@@ -56,7 +54,7 @@ class InitialView(NamedTuple):
         return json.dumps(values | ({"near": camera.near} if camera.near else {}))
 
     @staticmethod
-    def from_json(text: str) -> InitialView | None:
+    def from_json(text: str) -> "InitialView | None":
         """Parse the output of `to_json`. Returns None for any other text; the viewer then guesses a view."""
         with suppress(KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError):
             values: dict[str, Any] = json.loads(text)

@@ -3,8 +3,6 @@
 docs/format.md has it byte by byte. Browsers unpack it by themselves (DecompressionStream).
 """
 
-from __future__ import annotations
-
 import io
 import struct
 import zlib

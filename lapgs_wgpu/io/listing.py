@@ -1,7 +1,5 @@
 """What a folder holds, besides the files that desktops keep in it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 _DESKTOPS = (".DS_Store", "desktop.ini", "Thumbs.db")

@@ -4,8 +4,6 @@ Each Gaussian is a binary little-endian row of parameters before their activatio
 found by name, since other programs use other orders and add properties.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ Files are untrusted: the header's length is limited, and declared sizes are comp
 allocation. Elements with lists, such as the faces of a mesh, are passed over.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import warnings

@@ -1,7 +1,5 @@
 """Gaussians in .ply files of other programs: what their variants mean, and what their comments say."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys

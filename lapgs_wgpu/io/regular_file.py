@@ -1,7 +1,5 @@
 """Open untrusted files: no pipe, which would block, and no device, which may never end."""
 
-from __future__ import annotations
-
 import os
 import stat
 from collections.abc import Iterator

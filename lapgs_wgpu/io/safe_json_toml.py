@@ -3,8 +3,6 @@
 Parsing JSON takes at most 64 times the file size in memory. The TOML parser is slow, so its size limit is low.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -5,8 +5,6 @@ allocates no more memory than the file has bytes, and its errors name the tensor
 https://github.com/huggingface/safetensors#format
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping

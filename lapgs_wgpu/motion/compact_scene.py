@@ -4,8 +4,6 @@ The static hash grid is read only at the canonical means, so each Gaussian carri
 docs/format.md has the tensors; the web page (viewer/web) reads the same file.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any

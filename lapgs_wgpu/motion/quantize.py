@@ -4,8 +4,6 @@ Each value has a largest allowed error. A column's whole numbers span all of it 
 that; else the interval in which most values are within their allowed error. Those that are not are outliers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 

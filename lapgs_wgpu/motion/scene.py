@@ -1,7 +1,5 @@
 """The 4D scene: canonical Gaussians and the field that moves them, as stored in a checkpoint."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -118,7 +116,7 @@ class Scene4D:
         device: Device | None = None,
         seed: int = 0,
         own_field: nn.Module | None = None,
-    ) -> Scene4D:
+    ) -> "Scene4D":
         """A scene of isotropic Gaussians.
 
         points: (N, 3) means, world units. colors: (N, 3) in [0, 1]. scales: (N,) standard deviations, world units.

@@ -1,7 +1,5 @@
 """Read and validate the scene in a file as arrays, without torch, for Scene4D and for playback."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """The timing of a capture: which moment of the motion its images show at a time."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 

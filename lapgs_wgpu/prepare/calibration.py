@@ -6,8 +6,6 @@ camera), OpenCV's YAML as EasyMocap (K_1, dist_1, R_1 or Rot_1, T_1) and the exa
 R, T) name its matrices, and the .json of CMU Panoptic. All of these count pixels from the middle of the first one.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """The whole way from films to a capture: images, poses, masks of what moves."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import shutil

@@ -1,7 +1,5 @@
 """The folder of a capture that is being made: one writer, and nothing in it before all of it is there."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager

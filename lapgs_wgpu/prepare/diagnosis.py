@@ -1,7 +1,5 @@
 """What a capture is worth: a number for each property that decides, what is wanted, and what to film differently."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections import Counter

@@ -1,7 +1,5 @@
 """Films as phones and cameras record them: upright frames of square pixels in 8-bit RGB, each with its own time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path

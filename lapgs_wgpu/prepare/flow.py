@@ -4,8 +4,6 @@ Flow: DIS (Kroeger et al., "Fast optical flow using dense inverse search", 2016)
 chained from image to image. A place is lost where the flow forth and back do not meet.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 

@@ -4,8 +4,6 @@ Transfer functions: ITU-R BT.2100. A display of the web shows HDR's reference wh
 rolled off by a curve that keeps what is below three quarters of it.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The images of a capture: of each span of a film the sharpest frame, without repeated and blurred ones."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """What is prepared: films, and images that a camera took one after the other; folders, patterns, zip files of both."""
 
-from __future__ import annotations
-
 import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import suppress

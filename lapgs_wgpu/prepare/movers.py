@@ -6,8 +6,6 @@ one that walks leaves only what moves along the rays of its own path undecided. 
 flow; colors then draw the border (GrabCut: Rother, Kolmogorov, Blake 2004).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
@@ -58,7 +56,7 @@ class Judged(NamedTuple):
         known = np.isfinite(self.errors).mean(axis=(1, 2))
         return float(known[known > 0].mean()) if known.any() else 0.0
 
-    def explained(self, other: Judged) -> float:
+    def explained(self, other: "Judged") -> float:
         """How much of the images' area still points explain, in times of what they explain in another one, at the noise
         of the better of the two: what is nearly rigid fits wrong cameras nearly."""
         limit = SHARP * min(self.noise, other.noise)

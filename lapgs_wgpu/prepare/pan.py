@@ -4,8 +4,6 @@ Bundle adjustment of rotations (Brown and Lowe, "Automatic panoramic image stitc
 rotations that are chained through the film. What moves stays unexplained, and what is near where the camera walks.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 

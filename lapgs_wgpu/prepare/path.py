@@ -1,7 +1,5 @@
 """Signs of wrongly placed cameras: motion that no hand-held camera makes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

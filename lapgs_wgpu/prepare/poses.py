@@ -1,7 +1,5 @@
 """Camera poses by structure from motion with pycolmap: features, matches, and cameras that explain them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

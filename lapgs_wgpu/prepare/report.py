@@ -1,7 +1,5 @@
 """report.html: a diagnosis as one page that needs no other file: measures, camera positions, images, masks."""
 
-from __future__ import annotations
-
 import base64
 from html import escape
 from pathlib import Path

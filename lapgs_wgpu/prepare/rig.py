@@ -1,7 +1,5 @@
 """Cameras that stand still and film together: placed by what they see, or by a calibration, with images of one size."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math

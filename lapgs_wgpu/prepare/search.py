@@ -1,7 +1,5 @@
 """Which cameras explain a film: a pan, or the best of reconstructions that begin with several focal lengths."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """At what moment films of one event begin, by their sound: its onsets are compared at all shifts."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Buffer capacities of an image, predicted from earlier images."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

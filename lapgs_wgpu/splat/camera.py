@@ -1,7 +1,5 @@
 """The pinhole camera."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -56,7 +54,7 @@ class Camera:
         with np.errstate(divide="ignore", invalid="ignore"):
             return (local @ self.K.T)[:, :2] / local[:, 2:], local[:, 2]
 
-    def resized(self, width: int, height: int) -> Camera:
+    def resized(self, width: int, height: int) -> "Camera":
         """Return the same camera for an image of another size: width and height in pixels."""
         scale = np.diag([width / self.width, height / self.height, 1.0])
         return Camera(scale @ self.K, self.T_cam_world, width, height, self.near)
@@ -70,7 +68,7 @@ class Camera:
         fov_x: float,
         width: int,
         height: int,
-    ) -> Camera:
+    ) -> "Camera":
         """Return a camera with square pixels that looks at a point.
 
         Args:

@@ -1,7 +1,5 @@
 """The colors of Gaussians as a camera sees them, from spherical harmonics or plain ones, and back."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

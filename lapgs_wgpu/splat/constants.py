@@ -1,7 +1,5 @@
 """Constants that kernels and Python share: those of shaders/common/constants.wgsl, and the columns of a splat."""
 
-from __future__ import annotations
-
 import re
 
 from lapgs_wgpu.gpu.shader import shader_text

@@ -1,7 +1,5 @@
 """Results of the rasterizer's forward and backward passes, as arrays on the device."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple

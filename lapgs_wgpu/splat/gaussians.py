@@ -1,7 +1,5 @@
 """3D Gaussians at one time, activated, as the rasterizer takes them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 

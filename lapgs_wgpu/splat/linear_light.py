@@ -1,7 +1,5 @@
 """Spherical harmonics of linear light, fitted over all directions to those of displayed colors (sRGB)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

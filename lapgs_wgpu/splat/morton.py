@@ -4,8 +4,6 @@ Passes over the splats of a tile, and over the cells of hash grids, then use few
 rasterizer takes a seventh less time (docs/notes/speed.md).
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

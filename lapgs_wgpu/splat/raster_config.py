@@ -1,7 +1,5 @@
 """Configuration of the raster kernels for a device: tile size, and the pixels of each lane."""
 
-from __future__ import annotations
-
 import functools
 from dataclasses import dataclass, replace
 
@@ -44,7 +42,7 @@ class RasterConfig:
     def tile_defines(self) -> dict[str, int]:
         return {"TILE_W": self.tile_width, "TILE_H": self.tile_height}
 
-    def without_subgroups(self) -> RasterConfig:
+    def without_subgroups(self) -> "RasterConfig":
         """Return the same for a driver that splits workgroups into several subgroups.
 
         Loops are longer then, and rounds shorter.

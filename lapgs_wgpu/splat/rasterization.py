@@ -1,7 +1,5 @@
 """`rasterization`: gsplat's call, with its arguments and its dictionary, drawn by `rasterize`."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

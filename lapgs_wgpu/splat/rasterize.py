@@ -1,7 +1,5 @@
 """`rasterize`: the rasterizer as a differentiable function of torch tensors."""
 
-from __future__ import annotations
-
 import functools
 from typing import Any, NamedTuple
 

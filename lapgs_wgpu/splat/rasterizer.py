@@ -3,8 +3,6 @@
 Only `grow_on_overflow` and, the first time that a pass runs, `Rasterizer._subgroup_mismatch` wait for the device.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

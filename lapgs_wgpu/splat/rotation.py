@@ -1,7 +1,5 @@
 """Rotations by quaternions, differentiable."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

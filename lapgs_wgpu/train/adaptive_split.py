@@ -4,8 +4,6 @@ One that resembles its neighbours in shape, and differs from each of them alike 
 float64 on the canonical Gaussians, in one order: the same rows give the same answer to the last bit.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

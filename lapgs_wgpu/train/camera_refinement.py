@@ -10,8 +10,6 @@ of the image motion, over points of the scene, says how much each change is seen
 gradient (CamP, Park et al. 2023).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 

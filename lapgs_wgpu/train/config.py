@@ -4,8 +4,6 @@ but for keys that the config.toml of older runs lacks.
 Each key carries the text that lapgs-train --help shows of it. No torch here, which takes seconds to import.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping

@@ -4,8 +4,6 @@ Everything works on a mapping of rows: name -> (N, ...) tensor, of which means, 
 are looked at, and dynamics by the adaptive split; whatever else a Gaussian carries is inherited by its children.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -43,7 +41,7 @@ class Statistics:
     views: Tensor
 
     @staticmethod
-    def zeros(count: int) -> Statistics:
+    def zeros(count: int) -> "Statistics":
         """Nothing was seen yet."""
         return Statistics(*torch.zeros(2, count).unbind())
 
@@ -54,7 +52,7 @@ class Statistics:
         self.gradients += torch.where(visible, (d_means2d * to_ndc).norm(dim=1), 0.0)
         self.views += visible
 
-    def of(self, keep: Tensor) -> Statistics:
+    def of(self, keep: Tensor) -> "Statistics":
         """The statistics of the Gaussians of a mask (N,)."""
         return Statistics(*(values[keep] for values in vars(self).values()))
 

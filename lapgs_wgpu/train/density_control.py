@@ -1,7 +1,5 @@
 """Density control of a training: the statistics that it gathers, and the changes that it makes after steps."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 

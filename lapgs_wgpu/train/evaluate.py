@@ -3,8 +3,6 @@
 Both sides are compared as 8-bit pictures: the model of the last step, clamped and rounded, and the ground truth.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import time

@@ -1,8 +1,6 @@
 """A training step by torch's autograd, which exchanges buffers with the kernels: on CPU devices, whose memory is
 shared, and wherever torch computes a part of the step, such as a field or a loss of one's own."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -4,8 +4,6 @@ A correction is a matrix (3, 4): corrected color = its first three columns times
 applied to the rendered image before the losses, and never to a view that is measured.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A training step's image and loss without either leaving the device, as one autograd function."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple

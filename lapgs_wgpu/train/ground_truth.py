@@ -4,8 +4,6 @@ The host prepares an image once: it composites it over the background and marks 
 The image then stays on the device; the host reads it back where it needs it.
 """
 
-from __future__ import annotations
-
 import os
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
@@ -64,7 +62,7 @@ class GroundTruth:
             self._kept[view] = array
         return array
 
-    def on_host(self, view: View) -> HostImage:
+    def on_host(self, view: View) -> "HostImage":
         """The image of a view on the background. Raises InputError where it cannot be read."""
         return host_image(self.on_device(view).read())
 

@@ -1,7 +1,5 @@
 """The host of a training: threads of torch in a step, memory of the C library, and with what a run was made."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import platform

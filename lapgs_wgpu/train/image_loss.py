@@ -4,8 +4,6 @@ The order of the passes is that of `ImageLoss.record`; docs/architecture.md list
 device.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from lapgs_wgpu.gpu.array import DeviceArray

@@ -3,8 +3,6 @@
 In torch, differentiable, for any float dtype; all sums have a fixed order.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 

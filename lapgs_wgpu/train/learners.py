@@ -1,7 +1,5 @@
 """Everything that learns in a training, and by what: the Gaussians, the field, and corrections of the images."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 import torch

@@ -1,7 +1,5 @@
 """What a training tells while it runs: one progress line on the terminal, and log.jsonl in the run's folder."""
 
-from __future__ import annotations
-
 import json
 import math
 import time
@@ -45,7 +43,7 @@ class Log:
         self._start = self._began - (so_far or before)
         self._times: deque[float] = deque(maxlen=INTERVAL + 1)  # at which steps ended
 
-    def __enter__(self) -> Log:
+    def __enter__(self) -> "Log":
         return self
 
     def __exit__(

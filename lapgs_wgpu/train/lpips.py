@@ -1,7 +1,5 @@
 """LPIPS (Zhang et al. 2018) on VGG16, with weights that the user supplies: none may be passed on with this package."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch

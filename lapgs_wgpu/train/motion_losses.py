@@ -6,8 +6,6 @@ camera sees says nothing of how far away things are; its neighbours in time, see
 saturate, so that what really turns quickly is not held back.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Adam with a learning-rate schedule for each group of parameters, whose state follows Gaussians that come and go."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 

@@ -1,7 +1,5 @@
 """What a training is given by Python, beside its configuration (docs/api.md)."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections import Counter

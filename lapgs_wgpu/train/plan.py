@@ -1,7 +1,5 @@
 """The training that suits this machine and a capture: preset and number of steps, chosen by a measured step."""
 
-from __future__ import annotations
-
 import math
 import operator
 import statistics

@@ -3,8 +3,6 @@
 A file names every key, or starts from another preset (`base = "dnerf"`) and names what differs.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import importlib.resources

@@ -1,7 +1,5 @@
 """The corrections of cameras and colors in device arrays, and the passes of a resident step that use and move them."""
 
-from __future__ import annotations
-
 import torch
 
 from lapgs_wgpu.data.views import View

@@ -4,8 +4,6 @@ Between two looks of the host the device has the newest values. Whoever reads to
 next step pushes what the host may have changed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial

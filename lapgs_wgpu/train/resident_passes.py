@@ -1,7 +1,5 @@
 """The passes of a step that stays on the device, from parameters to parameters, recorded once and replayed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any

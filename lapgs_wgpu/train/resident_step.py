@@ -5,8 +5,6 @@ intersections did not fit, changes nothing, and neither does what is in flight b
 then mends the cause, and submits these steps again.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from functools import partial

@@ -1,7 +1,5 @@
 """The folder of a run: what lies in it, who may write to it, and the state from which a training goes on."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import shutil

@@ -1,8 +1,6 @@
 """What a training begins with: what it is given, opened and checked; what its configuration leaves to the data and the
 device; and its first Gaussians, initial points or what motion discovery found (lapgs_wgpu/discovery)."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import operator

@@ -5,8 +5,6 @@ step is judged by the length of all gradients and parameters together: one reduc
 where a value is not, and where a gradient's square overflows, which would end up in Adam's second moments.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType

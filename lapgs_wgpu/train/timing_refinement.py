@@ -7,8 +7,6 @@ before and shortly after. What the images around it have in common is the field'
 field. Images that are measured have the timing between those of the training.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The training, step by step, and everything that its next step depends on."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -141,7 +139,7 @@ class Trainer:
         """End what goes on beside the steps."""
         self._truth.close()
 
-    def __enter__(self) -> Trainer:
+    def __enter__(self) -> "Trainer":
         return self
 
     def __exit__(self, *error: object) -> None:

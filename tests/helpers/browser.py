@@ -1,7 +1,5 @@
 """Headless Chromium, driven over its DevTools protocol: real mouse and key events, and what is on the screen."""
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import io
@@ -73,7 +71,7 @@ class Browser:
             self._end()
             raise
 
-    def __enter__(self) -> Browser:
+    def __enter__(self) -> "Browser":
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:

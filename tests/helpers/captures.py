@@ -1,7 +1,5 @@
 """Captures of a few known Gaussians, drawn and written out in each layout that is read: what readers must undo."""
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Callable, Mapping, Sequence
@@ -38,7 +36,7 @@ class Blobs(NamedTuple):
     colors: Tensor
 
     @staticmethod
-    def random(count: int = 40, seed: int = 0) -> Blobs:
+    def random(count: int = 40, seed: int = 0) -> "Blobs":
         generator = torch.Generator().manual_seed(seed)
         means = torch.rand(count, 3, generator=generator) * 2 - 1 + torch.tensor([0.3, -0.2, 0.5])
         scales = 0.05 + 0.15 * torch.rand(count, 1, generator=generator).expand(count, 3)

@@ -1,7 +1,5 @@
 """Damage to a capture's files, and the sentence that must refuse it."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import struct

@@ -1,7 +1,5 @@
 """Small files of every kind to damage."""
 
-from __future__ import annotations
-
 import json
 import zlib
 from collections.abc import Callable

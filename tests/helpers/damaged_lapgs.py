@@ -1,7 +1,5 @@
 """Compact scenes, damaged at random: as a file, in what it unpacks to, or in its table."""
 
-from __future__ import annotations
-
 import json
 import struct
 import zlib

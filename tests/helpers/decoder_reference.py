@@ -1,7 +1,5 @@
 """The grid fields' decoder in float64 by autograd: what torch's decoder and the kernels are tested against."""
 
-from __future__ import annotations
-
 import math
 
 import torch

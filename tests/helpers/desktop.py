@@ -1,7 +1,5 @@
 """A screen without a monitor (Xvfb), real mouse and key events on it (xdotool), and what it shows."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal
@@ -31,7 +29,7 @@ class Desktop:
         self._folder = tempfile.TemporaryDirectory()
         self._processes: list[subprocess.Popen[str]] = []
 
-    def __enter__(self) -> Desktop:
+    def __enter__(self) -> "Desktop":
         read, write = os.pipe()
         command = ["Xvfb", "-displayfd", str(write), "-screen", "0", f"{SIZE[0]}x{SIZE[1]}x24", "-nolisten", "tcp"]
         # Without -noreset it starts anew, and takes no connections meanwhile, whenever the last program has left.

@@ -1,7 +1,5 @@
 """The rendered walk past a room as a dataset whose training poses are disturbed, and how far they are off."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A D-NeRF scene on the disk."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable

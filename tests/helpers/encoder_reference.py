@@ -1,7 +1,5 @@
 """The hash encoder in torch: what its kernels are tested against."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

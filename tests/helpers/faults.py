@@ -1,7 +1,5 @@
 """A disk that fails: from the n-th operation on that changes a folder, every further one ends in the same error."""
 
-from __future__ import annotations
-
 import builtins
 import errno
 import io
@@ -83,7 +81,7 @@ class _File:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._file, name)
 
-    def __enter__(self) -> _File:
+    def __enter__(self) -> "_File":
         return self
 
     def __exit__(self, *error: Any) -> None:

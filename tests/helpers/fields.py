@@ -1,7 +1,5 @@
 """Grid fields with random weights."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

@@ -1,7 +1,5 @@
 """Films with known cameras: a textured room in which a textured board moves, and files as phones write them."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from pathlib import Path

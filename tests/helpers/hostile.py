@@ -3,8 +3,6 @@
 A mutation is drawn by hypothesis as plain numbers and applied by plain functions, so that it shrinks and repeats.
 """
 
-from __future__ import annotations
-
 import copy
 import json
 import os

@@ -1,7 +1,5 @@
 """A step with a loss of the image."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

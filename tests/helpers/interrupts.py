@@ -1,7 +1,5 @@
 """Interrupts a training, and handles signals for a while."""
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

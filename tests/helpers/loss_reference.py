@@ -3,8 +3,6 @@
 Differentiable, for any float dtype; all sums have a fixed order.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn import functional

@@ -1,7 +1,5 @@
 """Playback of a file."""
 
-from __future__ import annotations
-
 import os
 
 from lapgs_wgpu.gpu.device import Device

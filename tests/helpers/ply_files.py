@@ -1,7 +1,5 @@
 """PLY files, whole and damaged."""
 
-from __future__ import annotations
-
 import struct
 import tracemalloc
 from collections.abc import Mapping, Sequence

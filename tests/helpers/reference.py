@@ -3,8 +3,6 @@
 One function per pass, named as its shader. Conventions (gsplat's) and numbers come from shaders/common/constants.wgsl.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """How a device rounds."""
 
-from __future__ import annotations
-
 from lapgs_wgpu.gpu.device import Device
 
 

@@ -1,7 +1,5 @@
 """The rows and offsets of samples, as common/samples.wgsl draws them, in integers of the host."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """A moving scene and its checkpoint; a still one with outliers."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Random Gaussians, cameras, and one step of gradient descent's forward and backward pass over them."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -100,12 +98,12 @@ class Weights(NamedTuple):
     depth: Tensor
 
     @staticmethod
-    def random(camera: Camera, seed: int = 0) -> Weights:
+    def random(camera: Camera, seed: int = 0) -> "Weights":
         generator = torch.Generator().manual_seed(seed)
         shape = (camera.height, camera.width)
         return Weights(*(torch.randn(*shape, *more, generator=generator) for more in ((3,), (), ())))
 
-    def without(self, pixels: Tensor) -> Weights:
+    def without(self, pixels: Tensor) -> "Weights":
         """No weight on these pixels (H, W)."""
         keep = ~pixels
         return Weights(self.image * keep[..., None], self.alpha * keep, self.depth * keep)

@@ -1,7 +1,5 @@
 """Every shape in which a shader of the package is composed: the defines that its host call can give it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from itertools import product
 

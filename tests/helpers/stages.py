@@ -1,7 +1,5 @@
 """Looking between the passes of the rasterizer."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

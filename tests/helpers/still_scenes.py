@@ -1,7 +1,5 @@
 """Fields of every kind, and a camera that sees the scenes of trained_scenes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from helpers.trained_scenes import CONFIGS, OURS

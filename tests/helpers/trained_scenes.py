@@ -1,7 +1,5 @@
 """Scenes of each field with random weights."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

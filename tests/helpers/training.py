@@ -1,7 +1,5 @@
 """A small training: its configuration."""
 
-from __future__ import annotations
-
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.presets import load_config
 

@@ -1,7 +1,5 @@
 """Waiting for what other programs do, on a machine that may do much else."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import TypeVar

@@ -1,7 +1,5 @@
 """Scenes as web pages in headless Chromium, on SwiftShader, and the same picture on the desktop."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -6,8 +6,6 @@ at the same step of each round the memory must be the same, once caches and allo
 into LAPGS_SOAK_OUT (soak.json).
 """
 
-from __future__ import annotations
-
 import gc
 import json
 import os

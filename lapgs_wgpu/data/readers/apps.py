@@ -4,8 +4,6 @@ docs/data.md lists the fields. Polycam's optimizer writes corrected_cameras/ (an
 corrected_images/), which are preferred to cameras/ and images/. Depth maps and the mesh are not read.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

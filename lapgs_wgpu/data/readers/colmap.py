@@ -4,8 +4,6 @@ Each folder below images/ is a camera, or a time (`stamps`). If the model places
 they do not move, and images of a camera that have no pose have that of its first one.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from lapgs_wgpu.data.capture_files import CaptureFiles, files_below

@@ -4,8 +4,6 @@ The formats are those of COLMAP's documentation (colmap.github.io/format.html). 
 declared count reserves no memory.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Callable, Iterator, Sequence

@@ -3,8 +3,6 @@
 docs/data.md lists the files. Cameras and points are returned in the coordinates of scene.json: (p - center) scale.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from pathlib import Path

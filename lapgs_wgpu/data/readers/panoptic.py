@@ -3,8 +3,6 @@
 docs/data.md lists the fields. Source: Luiten et al., Dynamic 3D Gaussians (3DV 2024).
 """
 
-from __future__ import annotations
-
 from pathlib import Path, PurePosixPath
 
 import numpy as np

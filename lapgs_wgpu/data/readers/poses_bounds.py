@@ -5,8 +5,6 @@ The pose is camera to world. R has the columns down, right and backward (LLFF); 
 its successors read it. In both, what is for testing follows published work.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from pathlib import Path

@@ -5,8 +5,6 @@ intrinsics of each or of all. docs/data.md lists the fields. nerfstudio's cloud 
 transform_matrix, since applied_transform was applied to both.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from pathlib import Path, PurePosixPath

@@ -1,7 +1,5 @@
 """Configuration of deformation fields, and derived sizes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -5,8 +5,6 @@ units; the field gives them no gradient. t: in [0, 1]. dynamics: (N, D) or None.
 A new field is the identity. `OwnField` makes a field of any nn.Module.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch
@@ -51,7 +49,7 @@ class Field(nn.Module):
         dynamics: Tensor | None = None,
         nearby: Nearby | None = None,
         time_samples: TimeSamples | None = None,
-    ) -> list[Deformation]:
+    ) -> "list[Deformation]":
         """Return the deformation at time t as `forward` does, and that of `time_samples` at each of its times."""
         moves = [self(means, t, dynamics, nearby)]
         if time_samples is not None:

@@ -3,8 +3,6 @@
 d: (N, D) float32, without a unit. The distance of a Gaussian is that between its row and the mean row.
 """
 
-from __future__ import annotations
-
 from torch import Tensor
 
 # Tolerance: distances that are equal except for rounding are no outliers.

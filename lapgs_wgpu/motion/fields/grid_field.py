@@ -1,7 +1,5 @@
 """The fields grid4d and laplacian (the paper's, an extension of grid4d), over four hash grids."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

@@ -1,8 +1,6 @@
 """The hash encoder as torch sees it: grids whose tables belong to torch; encoding and gradient run on the device
 (motion/passes/hash_encoder_passes)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 from typing import Any

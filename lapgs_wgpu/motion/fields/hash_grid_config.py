@@ -1,7 +1,5 @@
 """Shapes of multi-resolution hash grids (Instant-NGP, with the resolutions of Grid4D; paper eq. 1). Without torch."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The field hexplane, a baseline (4D-GS, Wu et al. 2024): features from six planes of space and time."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """The Laplacian motion module (paper eqs. 2 to 6): one spectrum of learnable frequencies moves all Gaussians."""
 
-from __future__ import annotations
-
 import math
 
 import torch

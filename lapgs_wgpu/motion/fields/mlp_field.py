@@ -1,7 +1,5 @@
 """The field mlp, a baseline (deformable 3DGS, Yang et al. 2024): one MLP of position and time, without grids."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """The field own: an nn.Module from outside the package, behind the interface of all fields (`deformation`)."""
 
-from __future__ import annotations
-
 import inspect
 from collections import Counter
 

@@ -1,7 +1,5 @@
 """Names and shapes of the parameters of fields, in the order of the module's state_dict. Without torch."""
 
-from __future__ import annotations
-
 from lapgs_wgpu.motion.fields.config import GEOMETRY, FieldConfig, static_grid, temporal_grids
 from lapgs_wgpu.motion.fields.hash_grid_config import TIME
 

@@ -5,8 +5,6 @@ single operators among threads, which takes longer than it saves where they are 
 results, follow from the number of Gaussians and not from that of the threads.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor

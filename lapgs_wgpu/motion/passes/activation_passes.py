@@ -1,7 +1,5 @@
 """From the Gaussians as they are trained to those that are drawn at a time, on the device, and back."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 

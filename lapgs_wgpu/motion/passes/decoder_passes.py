@@ -6,8 +6,6 @@ matrix products: spatial channels = static W_static^T; temporal channels = dynam
 W_temporal^T; features = gate(layers + biases); outputs = features W_heads^T.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from typing import NamedTuple

@@ -3,8 +3,6 @@
 Everything stays in device arrays. Gradients are added to arrays that the caller has cleared.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple

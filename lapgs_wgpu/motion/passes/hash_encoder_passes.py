@@ -4,8 +4,6 @@ All points share one time. Levels of a grid with a time axis are first sliced at
 looking up two planes for each point.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Gaussians that a step looks at more closely, drawn on the device."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial

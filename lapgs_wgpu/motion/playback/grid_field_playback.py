@@ -3,8 +3,6 @@
 What does not depend on the time is computed once. A time then costs the temporal encoding and one pass, `deform`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ Shapes are compared by the square roots of their covariances, whose columns lie 
 deviation: unlike quaternions they do not turn where the ellipsoid looks the same.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 

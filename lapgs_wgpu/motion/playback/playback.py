@@ -3,8 +3,6 @@
 torch is not imported for static scenes and for fields that the device evaluates: that would take longer than the rest.
 """
 
-from __future__ import annotations
-
 from typing import Protocol
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Playback of scenes that torch evaluates: other fields, and scenes in training."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 
