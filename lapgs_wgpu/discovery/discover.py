@@ -39,6 +39,7 @@ SHEET_DYNAMICS = 2.0  # in place of it: of all sheets, and of the last one's tim
 NEARLY_ALL = 0.8  # share of the surface points that tracks explain, above which the field has little left to learn
 ALL_TURN = 0.1  # of the field's highest rates, where all that moves turns: it forgets turns sooner than places
 RAMP_STEPS = 200  # over which learning rates rise after discovery, where schedule.warm_up is 0
+FOLLOWING = "motion discovery: following what moves from one time to the next"  # may take a minute
 SHOWN = 2.0 / 255  # least difference from the background of an image that shows something
 
 
@@ -158,7 +159,10 @@ class _Found(NamedTuple):
 def _in_hull(config: Config, dataset: Dataset, device: Device) -> _Found | None:
     """What moves between cameras all around, before initial points; None where nothing can be followed."""
     clouds = hull_points(dataset, config.points.box)
+    meter = Progress(1, "")
+    meter.at(1, lambda: FOLLOWING)
     tracks = find_tracks(clouds)
+    meter.clear()
     share = explained_share(clouds, tracks)
     if share < config.discovery.least:
         return None
@@ -170,7 +174,7 @@ def _in_residuals(config: Config, dataset: Dataset, device: Device, generator: t
     half_side, steps = config.points.box, config.discovery.steps
     meter = Progress(steps, "steps of motion discovery, part 1 of 2: what stands still")
     static, images, depths, corrections = static_fit(config, dataset, device, meter.at)
-    meter.at(steps, lambda: "motion discovery: following what moves from one time to the next")
+    meter.at(steps, lambda: FOLLOWING)
     background = BACKGROUND_LEVELS[config.data.background]
     if all(float(np.abs(image.image - background).max()) < SHOWN for image in images):
         raise InputError(
