@@ -1,6 +1,6 @@
 """Movers that masks show: cut-outs that are followed, and the cube in which things move."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from lapgs_wgpu.discovery.cutouts import cutout_tracks
 from lapgs_wgpu.discovery.discover import start_training
 from lapgs_wgpu.discovery.residual import Residual
 from lapgs_wgpu.discovery.static_fit import static_fit
+from lapgs_wgpu.discovery.tracks import Tracks
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.train.evaluate import evaluate
@@ -29,24 +30,45 @@ TAKEN = [drawn(camera, t, BOARD) for camera, t in zip(CAMERAS, TIMES, strict=Tru
 FAR = 5.0  # depth of what stands still
 
 
-def test_cutouts_show_what_moves_where_it_is_in_each_image() -> None:
-    depths = [np.full(mask.shape, FAR, np.float32) for _, mask in TAKEN]
-    units = [(image / 255).astype(np.float32) for image, _ in TAKEN]
-    masks = [mask for _, mask in TAKEN]
-    residuals = list(map(Residual, CAMERAS, TIMES, units, units, masks))
-    tracks, share = cutout_tracks(residuals, depths, 1.3)
+def followed(chosen: Sequence[int], hidden: float, repainted: int = 99) -> tuple[Tracks | None, float]:
+    """hidden: the depth of what the board hides. repainted: the image from which on the board has other colors."""
+    residuals, depths = [], []
+    for i in chosen:
+        image, mask = TAKEN[i]
+        unit = (image / 255).astype(np.float32)
+        unit[mask] = abs(unit[mask] - (i >= repainted))
+        residuals.append(Residual(CAMERAS[i], TIMES[i], unit, unit, mask))
+        depths.append(np.where(mask, hidden, FAR).astype(np.float32))
+    return cutout_tracks(residuals, depths, 1.3)
+
+
+@pytest.mark.parametrize(("hidden", "nearest"), [(FAR + 1, FAR), (FAR - 1, FAR - 1)], ids=["ground", "hidden"])
+def test_cutouts_show_what_moves_where_it_is_in_each_image(hidden: float, nearest: float) -> None:
+    tracks, share = followed(range(len(TAKEN)), hidden)
     assert tracks is not None
     assert share > 0.9
     for i, (camera, (image, mask)) in enumerate(zip(CAMERAS, TAKEN, strict=True)):
         seen = tracks.supported[i]
         pixels, depth = camera.project(tracks.paths[i, seen])
-        assert depth == pytest.approx(0.97 * FAR, abs=1e-3)
+        assert depth == pytest.approx(0.9 * nearest, abs=1e-3)
         x, y = pixels.astype(int).clip(0, [[127, 95]]).T
         assert mask[y, x].mean() > 0.9
         shown = np.zeros_like(mask)
         shown[y, x] = True
         assert np.abs(image[y, x] / 255 - tracks.colors[seen]).mean() < 0.06
         assert shown[mask].mean() > 0.4  # no more than a point a pixel
+
+
+def test_cutouts_go_on_where_the_images_have_a_gap() -> None:
+    chosen = [0, 1, 2, 7, 8, 9]
+    tracks, _ = followed(chosen, FAR, repainted=7)
+    assert tracks is not None
+    assert tracks.parts == 2
+    for i, number in enumerate(chosen):
+        middle = np.argwhere(TAKEN[number][1]).mean(axis=0)[::-1]
+        for k in range(tracks.parts):
+            pixels, _ = CAMERAS[number].project(tracks.paths[i, tracks.part == k])
+            assert pixels.mean(axis=0) == pytest.approx(middle, abs=20)
 
 
 def test_masks_are_completed_by_what_differs_beside_them() -> None:

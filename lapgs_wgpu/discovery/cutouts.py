@@ -31,7 +31,8 @@ LOST = 0.5  # share of a cut-out that must look alike
 VISIBLE = 0.3  # share of a cut-out that must lie in the image
 STIFF = 0.02  # weight of the affine part of a map against that before
 FOOT = 0.15  # of its height: the lowest part of a cut-out, which stands on the ground
-BEFORE = 0.97  # of the depth of the ground
+HIDDEN = 0.1  # quantile of the depths of what a cut-out hides, which lie behind it
+BEFORE = 0.9  # of the depth of the ground, and of that
 APART = -0.5, 0.5  # half sides of the box: how far the first and the last cut-out are moved away from the cameras
 FAR_BELOW = 3  # pixels; the ground that a foot stands on lies so far below
 
@@ -85,7 +86,7 @@ def cutout_tracks(
     number = np.repeat(np.arange(len(parts)), [len(colors) for _, colors in parts])
     paths = np.concatenate([paths for paths, _ in parts], axis=1)
     seen = np.stack([cutout.seen for cutout in cutouts], axis=1)
-    way = _common_way(paths, seen[:, number])
+    way = _common_way(paths, seen[:, number], np.array([each.time for each in residuals]))
     for k in range(len(cutouts)):  # beyond, it goes as all go
         first, last = np.flatnonzero(seen[:, k])[[0, -1]]
         own = number == k
@@ -118,14 +119,20 @@ def _show_nearest(cutouts: Sequence[_Cutout], seen: Mask) -> None:
         seen[:, k] = runs == runs[cutout.key]
 
 
-def _common_way(paths: Floats, seen: Mask) -> Floats:
-    """(T, 3) how far all tracks have moved on average since half of the clip."""
-    steps = np.zeros((len(paths), 3), np.float32)
-    for t in range(1, len(paths)):
-        both = seen[t] & seen[t - 1]
-        steps[t] = (paths[t, both] - paths[t - 1, both]).mean(axis=0) if both.any() else steps[t - 1]
-    way: Floats = np.cumsum(steps, axis=0)
-    return way - way[len(way) // 2]
+def _common_way(paths: Floats, seen: Mask, times: NDArray[np.float64]) -> Floats:
+    """(T, 3) how far all tracks have moved on average since half of the clip: where none is seen at two times one after
+    another, as fast as before and after."""
+    lapses = np.diff(times)
+    speeds = np.full((len(lapses), 3), np.nan)
+    for t, both in enumerate(seen[1:] & seen[:-1]):
+        if both.any():
+            speeds[t] = (paths[t + 1, both] - paths[t, both]).mean(axis=0) / lapses[t]
+    known = np.flatnonzero(np.isfinite(speeds[:, 0]))
+    if not len(known):
+        return np.zeros_like(paths[:, 0])
+    speeds = np.stack([np.interp(np.arange(len(speeds)), known, speeds[known, k]) for k in range(3)], axis=1)
+    way = np.concatenate([np.zeros((1, 3)), np.cumsum(speeds * lapses[:, None], axis=0)])
+    return (way - way[len(way) // 2]).astype(np.float32)
 
 
 def _levels(residual: Residual) -> list[Floats]:
@@ -234,8 +241,11 @@ def _depths(mask: Mask, depth: Floats) -> Floats:
         if np.isfinite(ground).mean() < 0.3 if len(ground) else True:  # below the image
             ring = ndimage.binary_dilation(part, iterations=8)
             ground = np.sort(free[ring][np.isfinite(free[ring])])[: max(1, int(0.3 * ring.sum()))]
-        if np.isfinite(ground).any():
-            result[part] = BEFORE * np.nanmedian(ground)
+        behind = depth[part][np.isfinite(depth[part])]
+        nearest = [np.nanmedian(ground)] if np.isfinite(ground).any() else []
+        nearest += [np.quantile(behind, HIDDEN)] if len(behind) else []
+        if nearest:
+            result[part] = BEFORE * min(nearest)
     return result
 
 

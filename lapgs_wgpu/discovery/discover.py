@@ -38,6 +38,7 @@ DYNAMICS = 0.5  # standard deviation of the dynamics attribute of a discovered G
 SHEET_DYNAMICS = 2.0  # in place of it: of all sheets, and of the last one's time
 NEARLY_ALL = 0.8  # share of the surface points that tracks explain, above which the field has little left to learn
 ALL_TURN = 0.1  # of the field's highest rates, where all that moves turns: it forgets turns sooner than places
+SHEETS = 0.3  # in place of it where sheets fade one after another: small ones are lost at higher rates
 RAMP_STEPS = 200  # over which learning rates rise after discovery, where schedule.warm_up is 0
 FOLLOWING = "motion discovery: following what moves from one time to the next"  # may take a minute
 SHOWN = 2.0 / 255  # least difference from the background of an image that shows something
@@ -130,7 +131,8 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
         scene.parameters[name] = torch.nn.Parameter(values.detach()[order])
     field_fitted = 0.0
     if tracks is not None and found.share >= NEARLY_ALL:
-        field_fitted = ALL_TURN if len(light) == len(np.unique(tracks.part)) else 1.0
+        all_turn = len(light) == len(np.unique(tracks.part))
+        field_fitted = ALL_TURN if all_turn else SHEETS if sheets else 1.0
     return Start(
         scene,
         ramp_steps=config.schedule.warm_up or RAMP_STEPS,

@@ -12,6 +12,8 @@ from lapgs_wgpu.data.views import Dataset, View, composite, small_views, spread_
 from lapgs_wgpu.discovery.residual import Floats, Residual
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.train.camera_refinement import Corrections
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config, changed
 from lapgs_wgpu.train.exposure import without_exposure
@@ -86,7 +88,7 @@ def static_fit(config: Config, dataset: Dataset, device: Device, progress: Calla
     for view in small:
         image = (composite(view.load(), background.numpy()) / 255).astype(np.float32)
         camera = view.camera if refinement is None else refinement.refined(view.camera)
-        rendering = training.scene.render(camera, view.time, background, depth=view.moving is not None)
+        rendering = training.scene.render(camera, view.time, background, depth=False)
         still = rendering.image.numpy(force=True)
         if (correction := training.exposure_of(view)) is not None:
             image = without_exposure(image, correction.numpy(force=True))
@@ -95,13 +97,24 @@ def static_fit(config: Config, dataset: Dataset, device: Device, progress: Calla
         moving = None if view.moving is None else view.moving()
         images.append(Residual(camera, view.time, image, still, moving))
         if moving is not None:
-            alpha = rendering.alpha.numpy(force=True)
-            depths.append(np.where(alpha > SOLID, rendering.depth.numpy(force=True) / np.maximum(alpha, SOLID), np.nan))
+            depths.append(_depth(training.scene, camera))
     corrections = None
     if refinement is not None:
         cameras = {before.camera: after.camera for before, after in zip(picked, small, strict=True)}
         corrections = {camera: refinement.correction(fitted) for camera, fitted in cameras.items()}
     return StaticFit(training.scene, images, depths or None, corrections)
+
+
+def _depth(scene: Scene4D, camera: Camera) -> Floats:
+    """(H, W) the depth of what stands still, world units, NaN where nothing does: by the mean of inverse depths, to
+    which gaps in a surface that show what is far behind it add little."""
+    still = scene.canonical()
+    with torch.no_grad():
+        inverse = 1 / torch.from_numpy(camera.project(still.means.numpy(force=True))[1]).float().clamp(min=camera.near)
+        colors, rest = inverse[:, None].expand(-1, 3).contiguous(), (still.quats, still.scales, still.opacities)
+        drawn = rasterize(still.means, *rest, colors, camera, antialiased=still.antialiased, device=scene.device)
+    alpha, total = drawn.alpha.numpy(force=True), drawn.image[..., 0].numpy(force=True)
+    return np.where(alpha > SOLID, alpha / np.maximum(total, 1e-9), np.nan).astype(np.float32)
 
 
 def _without_movers(view: View) -> View:
