@@ -1,10 +1,12 @@
 """Movers that masks show: cut-outs that are followed, and the cube in which things move."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from helpers.captures import bright, write_colmap, write_rig
 from helpers.films import Board, drawn, room_cloud, walk
 from PIL import Image
@@ -16,10 +18,12 @@ from lapgs_wgpu.data.views import composite, small_views
 from lapgs_wgpu.discovery.cutouts import cutout_tracks
 from lapgs_wgpu.discovery.discover import start_training
 from lapgs_wgpu.discovery.residual import Residual
-from lapgs_wgpu.discovery.static_fit import static_fit
+from lapgs_wgpu.discovery.static_fit import depth_of, static_fit
 from lapgs_wgpu.discovery.tracks import Tracks
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.evaluate import evaluate
 from lapgs_wgpu.train.presets import load_config
 
@@ -69,6 +73,24 @@ def test_cutouts_go_on_where_the_images_have_a_gap() -> None:
         for k in range(tracks.parts):
             pixels, _ = CAMERAS[number].project(tracks.paths[i, tracks.part == k])
             assert pixels.mean(axis=0) == pytest.approx(middle, abs=20)
+
+
+def test_what_is_far_behind_a_gap_adds_little_to_a_depth(device: Device) -> None:
+    camera = Camera.looking_at([0, 0, 0], [0, 0, 1], up=[0, -1, 0], fov_x=0.8, width=33, height=25)
+    means, opacities = torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, 40.0]]), torch.tensor([0.9, 0.95])
+    rows = {
+        "means": means,
+        "log_scales": means[:, 2:].log().expand(-1, 3).contiguous(),
+        "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(2, 1),
+        "opacity_logits": opacities.logit(),
+        "sh_dc": torch.zeros(2, 1, 3),
+        "sh_rest": torch.zeros(2, 15, 3),
+    }
+    scene = Scene4D(rows, load_config("film", {"field.kind": "static"}).field, device)
+    first, second = 0.9, 0.1 * 0.95
+    depth = (first + second) / (first / 2 + second / 40)  # 2.2; the mean of the depths is 5.6
+    assert depth_of(scene, camera)[12, 16] == pytest.approx(depth, rel=1e-3)
+    assert np.isnan(depth_of(scene, dataclasses.replace(camera, near=50.0))).all()
 
 
 def test_masks_are_completed_by_what_differs_beside_them() -> None:

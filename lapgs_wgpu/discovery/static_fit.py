@@ -97,7 +97,7 @@ def static_fit(config: Config, dataset: Dataset, device: Device, progress: Calla
         moving = None if view.moving is None else view.moving()
         images.append(Residual(camera, view.time, image, still, moving))
         if moving is not None:
-            depths.append(_depth(training.scene, camera))
+            depths.append(depth_of(training.scene, camera))
     corrections = None
     if refinement is not None:
         cameras = {before.camera: after.camera for before, after in zip(picked, small, strict=True)}
@@ -105,7 +105,7 @@ def static_fit(config: Config, dataset: Dataset, device: Device, progress: Calla
     return StaticFit(training.scene, images, depths or None, corrections)
 
 
-def _depth(scene: Scene4D, camera: Camera) -> Floats:
+def depth_of(scene: Scene4D, camera: Camera) -> Floats:
     """(H, W) the depth of what stands still, world units, NaN where nothing does: by the mean of inverse depths, to
     which gaps in a surface that show what is far behind it add little."""
     still = scene.canonical()
