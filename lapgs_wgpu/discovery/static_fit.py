@@ -109,10 +109,11 @@ def depth_of(scene: Scene4D, camera: Camera) -> Floats:
     """(H, W) the depth of what stands still, world units, NaN where nothing does: by the mean of inverse depths, to
     which gaps in a surface that show what is far behind it add little."""
     still = scene.canonical()
+    depths = camera.project(still.means.numpy(force=True))[1]
+    colors = (1 / torch.from_numpy(depths).float().clamp(min=camera.near))[:, None].repeat(1, 3)
     with torch.no_grad():
-        inverse = 1 / torch.from_numpy(camera.project(still.means.numpy(force=True))[1]).float().clamp(min=camera.near)
-        colors, rest = inverse[:, None].expand(-1, 3).contiguous(), (still.quats, still.scales, still.opacities)
-        drawn = rasterize(still.means, *rest, colors, camera, antialiased=still.antialiased, device=scene.device)
+        of_each = still.means, still.quats, still.scales, still.opacities, colors
+        drawn = rasterize(*of_each, camera, antialiased=still.antialiased, device=scene.device)
     alpha, total = drawn.alpha.numpy(force=True), drawn.image[..., 0].numpy(force=True)
     return np.where(alpha > SOLID, alpha / np.maximum(total, 1e-9), np.nan).astype(np.float32)
 
