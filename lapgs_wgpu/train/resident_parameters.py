@@ -18,7 +18,7 @@ from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.laplacian import VARIANCE_FLOOR, VARIANCE_SPREAD
 from lapgs_wgpu.motion.passes.activation_passes import GEOMETRY_FLOATS, SH_FLOATS
-from lapgs_wgpu.motion.passes.decoder_passes import FieldWeights
+from lapgs_wgpu.motion.passes.decoder_passes import DecoderPasses
 from lapgs_wgpu.motion.passes.grid_field_passes import FieldArrays
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.optimizer import LARGEST_FREQUENCY_STEP
@@ -74,7 +74,7 @@ class ResidentParameters:
     steps: by name of a tensor, how many steps have moved it.
     """
 
-    def __init__(self, learners: Learners, weights: FieldWeights | None) -> None:
+    def __init__(self, learners: Learners, weights: DecoderPasses | None) -> None:
         scene = learners.scene
         self._device, self._pool, self._weights = scene.device, BufferPool(scene.device), weights
         self._optimizer, self._frequencies = learners.optimizer, learners.frequencies
@@ -133,8 +133,8 @@ class ResidentParameters:
             if name.endswith(".table")
         ]
         places, shape = self._weights.places, (self._weights.count, 1)
-        rows = {name: (slice(p.first, p.first + tensors[name].numel()), every) for name, p in places.items()}
-        moved = places[FREQUENCIES].first if FREQUENCIES in rows else None
+        rows = {name: (slice(first, first + tensors[name].numel()), every) for name, first in places.items()}
+        moved = places.get(FREQUENCIES)
         return [*blocks, Block("weights", shape, "mlp", rows, moved=moved)]
 
     def push_values(self) -> None:
@@ -244,7 +244,7 @@ class ResidentParameters:
         assert self._weights is not None
         assert self._frequencies is not None
         kernel, config = Kernel.get(self._device, "adam_frequencies"), self._weights.config
-        given = {name: self._weights.places[f"motion.{name}"].first for name in ("alpha", "beta", "frequencies")}
+        given = {name: self._weights.places[f"motion.{name}"] for name in ("alpha", "beta", "frequencies")}
         given |= {"width": config.width, "components": config.components}
         bounds = {"limit": self._frequencies.limit, "largest": LARGEST_FREQUENCY_STEP}
         bounds |= {"floor": VARIANCE_FLOOR, "spread": VARIANCE_SPREAD}

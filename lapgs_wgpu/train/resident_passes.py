@@ -74,7 +74,7 @@ class ResidentPasses:
         config, scene = self._config, self._scene = learners.config, learners.scene
         self._device = scene.device
         self._field = GridFieldPasses(scene.device, scene.field_config) if isinstance(scene.field, GridField) else None
-        self.parameters = ResidentParameters(learners, self._field.weights if self._field else None)
+        self.parameters = ResidentParameters(learners, self._field.decoder if self._field else None)
         self.corrections = ResidentCorrections(learners)
         self._activation = ActivationPasses(scene.device, scene.field_config)
         self.rasterizer, self._losses = rasterizer_of(scene.device), image_loss_of(scene.device)

@@ -105,7 +105,7 @@ class ActivationPasses:
         arrays = {"geometry": geometry, "d_geometry": d_geometry, "values": values}
         arrays |= {"means": drawn.means, "scales": drawn.scales, "before": before.outputs, "after": after.outputs}
         arrays |= {"d_means": by_drawn.means, "d_scales": by_drawn.scales}
-        arrays |= {"biases_before": before.heads.biases, "biases_after": after.heads.biases}
+        arrays |= {"biases_before": before.biases, "biases_after": after.biases}
         arrays["samples"] = self._samples.uniform("line", before.sampling)
         arrays["acceleration"] = self._pool.varying("acceleration", write)
         for name in ("acceleration", "acceleration_bwd"):
@@ -128,4 +128,4 @@ class ActivationPasses:
         commands.run(kernel, -(-count * SH_FLOATS // 64), {**arrays, "harmonics": self._pool.constant(content)})
 
     def _moving(self, decoding: Decoding | None) -> dict[str, DeviceArray]:
-        return {} if decoding is None else {"biases": decoding.heads.biases, "outputs": decoding.outputs}
+        return {} if decoding is None else {"biases": decoding.biases, "outputs": decoding.outputs}

@@ -12,7 +12,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.config import FieldConfig, static_grid, temporal_grids
-from lapgs_wgpu.motion.passes.decoder_passes import DecoderPasses, Decoding, FieldWeights, Time
+from lapgs_wgpu.motion.passes.decoder_passes import DecoderPasses, Decoding, Time
 from lapgs_wgpu.motion.passes.hash_encoder_passes import HashEncoderPasses, PointSet
 from lapgs_wgpu.motion.passes.samples import SamplePasses, Sampling
 
@@ -21,7 +21,7 @@ class FieldArrays(NamedTuple):
     """What a field computes with, or the gradients of it.
 
     geometry: (N, 12), as common/geometry.wgsl has it; its gradient is not the field's. beside: (N, D + 1) dynamics
-    attributes, then ones. tables: (entries, 2) of each grid, the spatial one first. weights: of `FieldWeights`.
+    attributes, then ones. tables: (entries, 2) of each grid, the spatial one first. weights: of `DecoderPasses`.
     """
 
     geometry: DeviceArray
@@ -35,13 +35,12 @@ class GridFieldPasses:
 
     def __init__(self, device: Device, config: FieldConfig) -> None:
         self.config = config
-        self.weights = FieldWeights(device, config)
+        self.decoder = DecoderPasses(device, config)
         self._pool = BufferPool(device)
         self._samples = SamplePasses(device, self._pool)
         self._encoders = [HashEncoderPasses(device, [static_grid(config)], config.bound)]
         if temporal := temporal_grids(config):
             self._encoders.append(HashEncoderPasses(device, temporal, config.bound, first_table=1))
-        self._decoder = DecoderPasses(device, self.weights)
         self._device = device
 
     def decode(
@@ -57,12 +56,8 @@ class GridFieldPasses:
         if sampling is not None:
             beside = self._pool.array(f"beside {number}", (points.count, beside.shape[1]))
             self._samples.rows(commands, f"set {number}", sampling, arrays.beside, beside, back=False)
-        heads = self.weights.heads_at(commands, arrays.weights, number, t)
         inputs = dict(zip(("beside", "static", "temporal"), [beside, *encodings], strict=False))
-        outputs = self._pool.array(f"outputs {number}", (points.count, self.weights.outputs))
-        decoding = Decoding(t, sampling, points, inputs, heads, outputs)
-        self._decoder.decode(commands, arrays.weights, decoding)
-        return decoding
+        return self.decoder.decode(commands, arrays.weights, t, sampling, points, inputs)
 
     def decode_bwd(self, commands: Commands, decoding: Decoding, arrays: FieldArrays, gradients: FieldArrays) -> None:
         """Record the backward pass, from the outputs, which have become their gradient.
@@ -72,7 +67,7 @@ class GridFieldPasses:
         d_beside = gradients.beside
         if decoding.sampling is not None:
             d_beside = self._pool.array("d_beside", decoding.inputs["beside"].shape)
-        self._decoder.decode_bwd(commands, arrays.weights, decoding, d_beside, gradients.weights)
+        self.decoder.decode_bwd(commands, arrays.weights, decoding, d_beside, gradients.weights)
         if decoding.sampling is not None:
             number = decoding.points.number
             self._samples.rows(commands, f"set {number}", decoding.sampling, gradients.beside, d_beside, back=True)
