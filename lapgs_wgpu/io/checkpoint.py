@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.io.ply import GaussianSnapshot, read_gaussians, write_ply
+from lapgs_wgpu.io.ply import GaussianSnapshot, read_foreign, read_gaussians, write_ply
 from lapgs_wgpu.io.ply_elements import PathLike, PlyFile, open_ply
-from lapgs_wgpu.io.ply_foreign import read_foreign
 from lapgs_wgpu.io.safetensors_file import pack_tensors, unpack_tensors
 
 VERSION = 1

@@ -1,9 +1,12 @@
 """Gaussians in a .ply file in the layout of 3DGS (Inria), which every splat viewer opens.
 
 Each Gaussian is a binary little-endian row of parameters before their activations (docs/format.md). Properties are
-found by name, since other programs use other orders and add properties.
+found by name, since other programs use other orders, and leave out and add properties.
 """
 
+import json
+import re
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -12,10 +15,19 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
-from lapgs_wgpu.io.ply_elements import Element, Floats, PathLike, PlyFile
+from lapgs_wgpu.io.ply_elements import BAD_SHARE, SH_C0, Element, Floats, PathLike, PlyFile, read_colors
 
 MAX_LOG_SCALE = 44.0  # exp(2 * 44) still fits in float32: the variance is finite
-ANTIALIASED = "SplatRenderMode: mip"  # comment of files whose Gaussians are drawn antialiased
+_ANTIALIASED = "SplatRenderMode: mip"  # comment of files whose Gaussians are drawn antialiased
+_MOTION = re.compile(  # words of a property's name that speak of time or of motion
+    "(.*_)?(trbf|motion|omega|velocity|vel|v[xyz]|rot_r|t|time|timestamp|duration|lifetime|poly|fourier|traj|deform|temporal)"
+    "(_.*)?",
+    re.IGNORECASE,
+)
+_FLAT = float(np.log(1e-7))  # log of the smallest scale that is drawn
+_SCALES, _UNTURNED = {"scale_0", "scale_1", "scale_2"}, {"rot_0": 1.0, "rot_1": 0.0, "rot_2": 0.0, "rot_3": 0.0}
+_OPAQUE = 20.0  # its sigmoid is 1 in float32
+_FAR = 100.0  # distance of the scene's middle from the origin, in extents of the scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,32 +78,23 @@ def write_ply(
     a further element, whose rows are the buffers. Raises InputError when the file cannot be written or a value could
     not be read back.
     """
-    rows = _vertex_rows(still, path)
+    n, rest = len(still), still.sh.shape[1] - 1
+    if n == 0:
+        raise InputError(f"{path}: not written, because it would hold 0 Gaussians; at least 1 is needed")
+    higher = np.zeros((n, 3, 15), np.float32)  # all of red, then green, then blue
+    higher[:, :, :rest] = still.sh[:, 1:].transpose(0, 2, 1)
+    normals, logits = np.zeros((n, 3), np.float32), still.opacity_logits[:, None]  # 3DGS leaves normals at 0
+    parts = [still.means, normals, still.sh[:, 0], higher.reshape(n, 45), logits, still.log_scales, still.quats]
+    rows = np.concatenate(parts, axis=1, dtype="<f4")
+    _check_values(rows, _WRITTEN_NAMES, f"{path}: not written, because")
     properties = "".join(f"property float {name}\n" for name in _WRITTEN_NAMES)
-    comment = f"comment {ANTIALIASED}\n" if antialiased else ""
+    comment = f"comment {_ANTIALIASED}\n" if antialiased else ""
     # Some viewers expect the count on the third line.
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(still)}\n{properties}{comment}{trailer}"
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {n}\n{properties}{comment}{trailer}"
     with atomic_write(path) as file:
         file.write(f"{header}end_header\n".encode())
         for buffer in (rows.data, *buffers):
             file.write(buffer)
-
-
-def _vertex_rows(still: GaussianSnapshot, path: PathLike) -> Floats:
-    """(N, 62) little-endian rows as in 3DGS. path: for errors. Raises InputError if they could not be read back."""
-    if len(still) == 0:
-        raise InputError(f"{path}: not written, because it would hold 0 Gaussians; at least 1 is needed")
-    rest = still.sh.shape[1] - 1
-    rows = np.zeros((len(still), 62), "<f4")  # 3:6 are the normals, which 3DGS leaves at 0
-    rows[:, 0:3] = still.means
-    rows[:, 6:9] = still.sh[:, 0]
-    for channel in range(3):  # channel-major: all of red, then green, then blue
-        rows[:, 9 + 15 * channel :][:, :rest] = still.sh[:, 1:, channel]
-    rows[:, 54] = still.opacity_logits
-    rows[:, 55:58] = still.log_scales
-    rows[:, 58:62] = still.quats
-    _check_values(rows, _WRITTEN_NAMES, f"{path}: not written, because")
-    return rows
 
 
 def read_gaussians(ply: PlyFile) -> GaussianSnapshot:
@@ -101,8 +104,65 @@ def read_gaussians(ply: PlyFile) -> GaussianSnapshot:
     a value that cannot be rendered.
     """
     vertex = vertex_of(ply)
-    names = gaussian_names(vertex, set(vertex.properties), ply.path)
-    return snapshot_of(ply.columns(vertex, names), names, ply.path)
+    names = _column_names(vertex, set(vertex.properties), ply.path)
+    return _snapshot(ply.columns(vertex, names), names, ply.path)
+
+
+def read_foreign(ply: PlyFile) -> tuple[GaussianSnapshot, dict[str, str]]:
+    """The Gaussians of a 3DGS .ply of any program, and as metadata what else it says. Notes go to stderr.
+
+    Metadata: `antialiased` is "true" where a comment says so; `up`, an axis such as "z" or "-y", is the comment's
+    vertical axis; `offset` is a JSON list of 3 numbers, which were taken off the means.
+
+    Degree 0 may be given as colors; the third scale of flat Gaussians, or two scales and the quaternion of spherical
+    ones, may be missing. An infinite opacity is opaque, or leaves the Gaussian out; a scale of 0 is flat; a quaternion
+    of 0 does not turn. A few rows that cannot be rendered are left out. Raises InputError for all else that
+    `read_gaussians` refuses, and for Gaussians that move.
+    """
+    vertex = vertex_of(ply)
+    moving = [name for name in vertex.properties if _MOTION.fullmatch(name)]
+    if moving:
+        raise InputError(
+            f"{ply.path}: its Gaussians move (properties {', '.join(moving[:5])}, {len(moving)} in all), as in "
+            "Spacetime Gaussians, of which no still is read; lapgs-view plays those with a cubic motion"
+        )
+    held, missing = set(vertex.properties), dict[str, Floats | float]()
+    scales = held & _SCALES
+    if scales == {"scale_0", "scale_1"}:
+        missing["scale_2"] = _FLAT
+    elif scales == {"scale_0"}:
+        missing |= dict.fromkeys(("scale_1", "scale_2"), ply.columns(vertex, ["scale_0"])[:, 0])
+        if not held & set(_UNTURNED):
+            missing |= _UNTURNED
+    if not held & {"f_dc_0", "f_dc_1", "f_dc_2"} and "opacity" in held:
+        colors = read_colors(ply, vertex)
+        if colors is not None:
+            missing |= {f"f_dc_{i}": (colors[:, i] - 0.5) / np.float32(SH_C0) for i in range(3)}
+    names = _column_names(vertex, held | set(missing), ply.path)
+    unused = [name for name in vertex.properties if name not in (*names, "nx", "ny", "nz", "red", "green", "blue")]
+    if unused:
+        _note(ply.path, f"{len(unused)} further properties, such as {', '.join(unused[:5])}, are not used")
+    values = ply.columns(vertex, [name for name in names if name not in missing])
+    for index, name in enumerate(names):
+        if name in missing:
+            values = np.insert(values, index, missing[name], axis=1)
+    metadata, text = {}, "\n".join(ply.comments)
+    if re.search(r"SplatRenderMode\s*[:=]\s*mip", text, re.IGNORECASE):
+        metadata["antialiased"] = "true"
+    axis = re.search(r"(?:vertical|up)[ _]?axis\s*[:=]\s*\+?(-?[xyz])\b", text, re.IGNORECASE)
+    if axis:
+        metadata["up"] = axis[1].lower()
+    middle, extent = _middle_and_extent(values[:, :3].astype(np.float64))
+    if np.abs(middle).max() > _FAR * extent:
+        means = ply.columns(vertex, ["x", "y", "z"], np.float64)  # in float32 they are terraces
+        middle, extent = _middle_and_extent(means)
+        if extent > 0:
+            offset = np.round(middle, max(0, -int(np.floor(np.log10(extent)))))
+            with np.errstate(over="ignore"):
+                values[:, :3] = means - offset
+            metadata["offset"] = json.dumps(offset.tolist())
+            _note(ply.path, f"lies far from the origin: {offset.tolist()} is taken off all coordinates")
+    return _snapshot(_mended(values, names, ply.path), names, ply.path), metadata
 
 
 def vertex_of(ply: PlyFile) -> Element:
@@ -112,8 +172,8 @@ def vertex_of(ply: PlyFile) -> Element:
     return ply.elements["vertex"]
 
 
-def snapshot_of(values: Floats, names: list[str], path: PathLike) -> GaussianSnapshot:
-    """The Gaussians of columns (N, len(names)) in the order of `gaussian_names`. Raises InputError as above."""
+def _snapshot(values: Floats, names: list[str], path: PathLike) -> GaussianSnapshot:
+    """The Gaussians of columns (N, len(names)) in the order of `_column_names`. Raises InputError as above."""
     _check_values(values, names, f"{path}:")
     rest = len(names) - len(_names(0))
     parts = np.split(values, np.cumsum([3, 3, rest, 1, 3]), axis=1)
@@ -124,7 +184,7 @@ def snapshot_of(values: Floats, names: list[str], path: PathLike) -> GaussianSna
     return GaussianSnapshot(means, sh, opacities[:, 0], scales, quats)
 
 
-def gaussian_names(vertex: Element, known: set[str], path: PathLike) -> list[str]:
+def _column_names(vertex: Element, known: set[str], path: PathLike) -> list[str]:
     """Names of all columns that Gaussians need, in the order of 3DGS.
 
     known: properties that the file has, or that follow from others. Raises InputError unless these are complete.
@@ -153,7 +213,7 @@ def gaussian_names(vertex: Element, known: set[str], path: PathLike) -> list[str
     return names
 
 
-def problems(values: Floats, names: list[str]) -> Iterator[tuple[NDArray[np.bool_], str]]:
+def _problems(values: Floats, names: list[str]) -> Iterator[tuple[NDArray[np.bool_], str]]:
     """Rows (N,) of values (N, len(names)) that cannot be rendered, and why: those not finite once activated."""
     finite = np.isfinite(values)
     for column in np.flatnonzero(~finite.all(axis=0)):
@@ -168,9 +228,42 @@ def problems(values: Floats, names: list[str]) -> Iterator[tuple[NDArray[np.bool
 
 def _check_values(values: Floats, names: list[str], where: str) -> None:
     """Raises InputError where rows cannot be rendered."""
-    for bad, what in problems(values, names):
+    for bad, what in _problems(values, names):
         if bad.any():
             raise InputError(
                 f"{where} {what} in {np.count_nonzero(bad)} of {len(bad)} rows, first in row {np.flatnonzero(bad)[0]} "
                 "(counted from 0); the file is damaged or its training diverged"
             )
+
+
+def _note(path: PathLike, text: str) -> None:
+    print(f"note: {path}: {text}.", file=sys.stderr)
+
+
+def _middle_and_extent(means: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Median (3,) of means (N, 3), and the longest side of the box around nine tenths of them; 0 of no finite ones."""
+    finite = means[np.isfinite(means).all(axis=1)]
+    if not len(finite):
+        return np.zeros(3), 0.0
+    low, middle, high = np.quantile(finite, [0.05, 0.5, 0.95], axis=0)
+    return middle, float((high - low).max())
+
+
+def _mended(values: Floats, names: list[str], path: PathLike) -> Floats:
+    """Replace in columns what is legal and cannot be rendered as it is, and leave out rows."""
+    opacities, scales, quats = values[:, -8], values[:, -7:-4], values[:, -4:]
+    invisible = opacities == -np.inf
+    opacities[opacities == np.inf] = _OPAQUE
+    scales[scales == -np.inf] = _FLAT
+    quats[(quats == 0).all(axis=1)] = [1, 0, 0, 0]
+    bad = np.zeros(len(values), bool)
+    for rows, _ in _problems(values, names):
+        bad |= rows & ~invisible
+    if bad.mean() > BAD_SHARE:
+        return values  # refused as a whole
+    if bad.any():
+        _note(path, f"{bad.sum()} of {len(bad)} Gaussians hold NaN, infinite or enormous values and are left out")
+    if invisible.all():
+        raise InputError(f"{path}: no Gaussian is visible (property opacity is minus infinity in all {len(bad)} rows)")
+    kept = ~(bad | invisible)
+    return values if kept.all() else values[kept]

@@ -110,20 +110,14 @@ class Deformed(NamedTuple):
     at_times: list[tuple[Tensor, Tensor]]
 
 
-def linear(shape: tuple[int, ...], generator: torch.Generator) -> nn.Linear:
-    """Return a linear layer with a weight of this shape (outputs, inputs) and torch's own initial distribution."""
-    layer = zero_head(shape)
-    reach = shape[1] ** -0.5
-    with torch.no_grad():
-        layer.weight.uniform_(-reach, reach, generator=generator)
-        layer.bias.uniform_(-reach, reach, generator=generator)
-    return layer
-
-
-def zero_head(shape: tuple[int, ...]) -> nn.Linear:
-    """Return a linear layer with a weight of this shape (outputs, inputs), all zero: it starts without effect."""
+def linear(shape: tuple[int, ...], generator: torch.Generator | None = None) -> nn.Linear:
+    """Return a linear layer with a weight of this shape (outputs, inputs) and torch's own initial distribution; without
+    a generator all zero, so that it starts without effect."""
     outputs, inputs = shape
-    layer = nn.Linear(inputs, outputs)
-    nn.init.zeros_(layer.weight)
-    nn.init.zeros_(layer.bias)
+    layer, reach = nn.Linear(inputs, outputs), inputs**-0.5
+    for values in layer.parameters():
+        if generator is None:
+            nn.init.zeros_(values)
+        else:
+            nn.init.uniform_(values, -reach, reach, generator)
     return layer

@@ -5,7 +5,7 @@ from torch import Tensor, nn
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import GEOMETRY, TEMPORAL_AXES, FieldConfig
-from lapgs_wgpu.motion.fields.deformation import Deformation, Field, Nearby, TimeSamples, linear, zero_head
+from lapgs_wgpu.motion.fields.deformation import Deformation, Field, Nearby, TimeSamples, linear
 from lapgs_wgpu.motion.fields.hash_encoder import HashEncoder, HashGrid
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion, TimeMotion
 from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
@@ -39,12 +39,12 @@ class GridField(Field):
         self.temporal = layer("temporal")
         hidden = [(layer(f"hidden.{2 * i}"), nn.ReLU()) for i in range(config.depth)]
         self.hidden = nn.Sequential(*(each for pair in hidden for each in pair))
-        self.heads = zero_head(shapes["heads.weight"])
+        self.heads = linear(shapes["heads.weight"])
         self.motion: LaplacianMotion | TimeMotion | None = None
         if config.kind == "laplacian":
             kind = LaplacianMotion if config.motion == "laplacian" else TimeMotion
             self.motion = kind(self.static_grid.features, config, generator)
-        self.appearance = zero_head(shapes["appearance.weight"]) if config.appearance_size else None
+        self.appearance = linear(shapes["appearance.weight"]) if config.appearance_size else None
 
     @property
     def grids(self) -> list[HashGrid]:

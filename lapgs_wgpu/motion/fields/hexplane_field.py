@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from lapgs_wgpu.motion.fields.config import FieldConfig
-from lapgs_wgpu.motion.fields.deformation import Deformation, Field, Nearby, linear, zero_head
+from lapgs_wgpu.motion.fields.deformation import Deformation, Field, Nearby, linear
 from lapgs_wgpu.motion.fields.hash_grid_config import TIME
 from lapgs_wgpu.motion.fields.parameter_shapes import HEXPLANE_HEADS, PLANES, parameter_shapes
 
@@ -31,19 +31,14 @@ class HexPlaneField(Field):
             if PLANES[number % len(PLANES)][1] != TIME:
                 plane.uniform_(0.1, 0.5, generator=generator)
             self.planes.append(nn.Parameter(plane))
-        layers: list[nn.Module] = [linear(shapes["trunk.0.weight"], generator)]
-        for i in range(config.depth):
-            layers += [nn.ReLU(), linear(shapes[f"trunk.{2 * i + 2}.weight"], generator)]
-        self.trunk = nn.Sequential(*layers)
-        self.heads = nn.ModuleList(
-            nn.Sequential(
-                nn.ReLU(),
-                linear(shapes[f"heads.{i}.1.weight"], generator),
-                nn.ReLU(),
-                zero_head(shapes[f"heads.{i}.3.weight"]),
-            )
-            for i in range(len(HEXPLANE_HEADS))
-        )
+
+        def layer(name: str, generator: torch.Generator | None = generator) -> list[nn.Module]:
+            return [nn.ReLU(), linear(shapes[f"{name}.weight"], generator)]
+
+        trunk = [each for i in range(config.depth + 1) for each in layer(f"trunk.{2 * i}")]
+        self.trunk = nn.Sequential(*trunk[1:])  # not rectified before
+        heads = [f"heads.{i}" for i in range(len(HEXPLANE_HEADS))]
+        self.heads = nn.ModuleList(nn.Sequential(*layer(f"{h}.1"), *layer(f"{h}.3", None)) for h in heads)
 
     def forward(
         self, means: Tensor, t: float, dynamics: Tensor | None = None, nearby: Nearby | None = None

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from lapgs_wgpu.motion.fields.config import FieldConfig
-from lapgs_wgpu.motion.fields.deformation import Deformation, Field, Nearby, linear, zero_head
+from lapgs_wgpu.motion.fields.deformation import Deformation, Field, Nearby, linear
 from lapgs_wgpu.motion.fields.parameter_shapes import (
     MLP_LAYERS,
     MLP_OUTPUTS,
@@ -29,7 +29,7 @@ class MlpField(Field):
             linear(shapes["time.0.weight"], generator), nn.ReLU(), linear(shapes["time.2.weight"], generator)
         )
         self.layers = nn.ModuleList(linear(shapes[f"layers.{i}.weight"], generator) for i in range(MLP_LAYERS))
-        self.heads = zero_head(shapes["heads.weight"])
+        self.heads = linear(shapes["heads.weight"])
 
     def forward(
         self, means: Tensor, t: float, dynamics: Tensor | None = None, nearby: Nearby | None = None

@@ -1,7 +1,6 @@
 """From the Gaussians as they are trained to those that are drawn at a time, on the device, and back."""
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
@@ -58,9 +57,8 @@ class ActivationPasses:
         shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
         drawn = {name: self._pool.array(name, shape) for name, shape in shapes.items()}
         colors = self._pool.array("sh", (n, (degree + 1) ** 2, 3))
-        arrays = drawn | self._moving(decoding) | {"geometry": geometry, "sh": sh, "colors": colors}
-        self._geometry(commands, "activate", decoding, arrays)
-        self._colors(commands, decoding, arrays, back=False)
+        arrays = drawn | {"geometry": geometry, "sh": sh, "colors": colors}
+        self._run(commands, decoding, arrays, back=False)
         return Gaussians(**drawn, sh=colors, antialiased=antialiased)
 
     def activate_bwd(
@@ -75,11 +73,10 @@ class ActivationPasses:
     ) -> None:
         """Record the gradients: d_geometry is added to, d_sh written, and the decoding's outputs become theirs."""
         assert by_drawn.sh is not None
-        arrays = self._moving(decoding) | {"geometry": geometry, "opacities": drawn.opacities, "d_geometry": d_geometry}
+        arrays = {"geometry": geometry, "opacities": drawn.opacities, "d_geometry": d_geometry}
         arrays |= {"d_splats": by_drawn.splats, "d_means": by_drawn.means, "d_quats": by_drawn.quats}
         arrays |= {"d_scales": by_drawn.scales, "sh": d_sh, "colors": by_drawn.sh}
-        self._geometry(commands, "activate_bwd", decoding, arrays)
-        self._colors(commands, decoding, arrays, back=True)
+        self._run(commands, decoding, arrays, back=True)
 
     def acceleration(
         self,
@@ -112,20 +109,19 @@ class ActivationPasses:
             commands.run(Kernel.get(self._device, name), -(-before.points.count // 64), arrays)
         return values
 
-    def _geometry(self, commands: Commands, name: str, decoding: Decoding | None, arrays: Mapping[str, Any]) -> None:
-        """Record `activate` or `activate_bwd`."""
+    def _run(
+        self, commands: Commands, decoding: Decoding | None, arrays: dict[str, DeviceArray], *, back: bool
+    ) -> None:
+        """Record `activate` or `activate_bwd`, and `activate_sh`, between the harmonics that are trained and the colors
+        that are drawn."""
         count, moving = arrays["geometry"].shape[0], decoding is not None
-        kernel = Kernel.get(self._device, name, MOVING=moving, OPACITY=moving and self._config.appearance_size > 3)
-        content = kernel.uniform("Activate", gaussians=count, outputs=self._outputs, mirror=self._mirror)
-        commands.run(kernel, -(-count // 64), {**arrays, "activation": self._pool.constant(content)})
-
-    def _colors(self, commands: Commands, decoding: Decoding | None, arrays: Mapping[str, Any], *, back: bool) -> None:
-        """Record `activate_sh`, between the harmonics that are trained and the colors that are drawn."""
-        count, changes = arrays["sh"].shape[0], decoding is not None and self._config.appearance_size > 0
-        kernel = Kernel.get(self._device, "activate_sh", COLOR=changes, BACK=back)
-        floats = 3 * arrays["colors"].shape[1]
-        content = kernel.uniform("Harmonics", gaussians=count, outputs=self._outputs, floats=floats)
-        commands.run(kernel, -(-count * SH_FLOATS // 64), {**arrays, "harmonics": self._pool.constant(content)})
-
-    def _moving(self, decoding: Decoding | None) -> dict[str, DeviceArray]:
-        return {} if decoding is None else {"biases": decoding.biases, "outputs": decoding.outputs}
+        if decoding is not None:
+            arrays |= {"biases": decoding.biases, "outputs": decoding.outputs}
+        changes = self._config.appearance_size if moving else 0
+        kernel = Kernel.get(self._device, "activate_bwd" if back else "activate", MOVING=moving, OPACITY=changes > 3)
+        sizes = {"gaussians": count, "outputs": self._outputs}
+        activation = self._pool.constant(kernel.uniform("Activate", mirror=self._mirror, **sizes))
+        commands.run(kernel, -(-count // 64), arrays | {"activation": activation})
+        kernel = Kernel.get(self._device, "activate_sh", COLOR=changes > 0, BACK=back)
+        harmonics = self._pool.constant(kernel.uniform("Harmonics", floats=3 * arrays["colors"].shape[1], **sizes))
+        commands.run(kernel, -(-count * SH_FLOATS // 64), arrays | {"harmonics": harmonics})
