@@ -13,8 +13,7 @@ from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.gpu.recording import Recording
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.passes.activation_passes import ActivationPasses, Line
-from lapgs_wgpu.motion.passes.decoder_passes import Decoding
-from lapgs_wgpu.motion.passes.grid_field_passes import GridFieldPasses
+from lapgs_wgpu.motion.passes.grid_field_passes import Decoding, GridFieldPasses
 from lapgs_wgpu.motion.passes.samples import Samples
 from lapgs_wgpu.splat.drawing import Drawing, GaussianGradients
 from lapgs_wgpu.splat.gaussians import Gaussians
@@ -74,7 +73,7 @@ class ResidentPasses:
         config, scene = self._config, self._scene = learners.config, learners.scene
         self._device = scene.device
         self._field = GridFieldPasses(scene.device, scene.field_config) if isinstance(scene.field, GridField) else None
-        self.parameters = ResidentParameters(learners, self._field.decoder if self._field else None)
+        self.parameters = ResidentParameters(learners, self._field)
         self.corrections = ResidentCorrections(learners)
         self._activation = ActivationPasses(scene.device, scene.field_config)
         self.rasterizer, self._losses = rasterizer_of(scene.device), image_loss_of(scene.device)

@@ -7,7 +7,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.config import GEOMETRY, FieldConfig
-from lapgs_wgpu.motion.passes.decoder_passes import Decoding
+from lapgs_wgpu.motion.passes.grid_field_passes import Decoding
 from lapgs_wgpu.motion.passes.samples import SamplePasses
 from lapgs_wgpu.splat.drawing import GaussianGradients
 from lapgs_wgpu.splat.gaussians import Gaussians
