@@ -81,9 +81,14 @@ def unpack_tensors(file: BinaryIO, size: int, where: str) -> tuple[dict[str, Arr
         position = end
     if position != rest:
         raise InputError(f"{where}: its tensors end at byte {position}, its data at {rest}; the file is damaged")
-    return {
-        name: _read_array(file, shape, code, f"{where}: tensor {name[:80]!r}") for (_, shape, code), name in entries
-    }, metadata
+    tensors: dict[str, Array] = {}
+    for (_, shape, code), name in entries:
+        array, which = np.empty(shape, _DTYPES[code]), f"{where}: tensor {name[:80]!r}"
+        if file.readinto(array.reshape(-1).view(np.uint8)) != array.nbytes:  # type: ignore[attr-defined]  # all have it
+            raise InputError(f"{which}: became shorter while it was read")
+        _check_finite(array, which)
+        tensors[name] = array
+    return tensors, metadata
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -107,14 +112,6 @@ def _parse_entry(name: str, entry: Any, where: str) -> tuple[tuple[int, int], tu
         f"{where}: tensor {name[:80]!r} is declared as {shown(entry)}, which is no shape of a known dtype with the "
         "data_offsets of as many bytes; the file is damaged"
     )
-
-
-def _read_array(file: BinaryIO, shape: tuple[int, ...], code: str, where: str) -> Array:
-    array = np.empty(shape, _DTYPES[code])
-    if file.readinto(array.reshape(-1).view(np.uint8)) != array.nbytes:  # type: ignore[attr-defined]  # all have it
-        raise InputError(f"{where}: became shorter while it was read")
-    _check_finite(array, where)
-    return array
 
 
 def _check_finite(array: Array, what: str) -> None:

@@ -72,24 +72,31 @@ def compress(
     finer: factor of the largest errors that are allowed.
     """
     formats = _row_formats(config, sh_degree)
-    stored = {name: gaussians[name].reshape(len(gaussians["means"]), -1)[:, : formats[name][0]] for name in formats}
+    held = held_rows(gaussians["opacity_logits"], config)
+    stored = {name: gaussians[name][held].reshape(len(held), -1)[:, :size] for name, (size, _, _) in formats.items()}
     stored["log_scales"] = np.maximum(stored["log_scales"], np.float32(math.log(MIN_SCALE)))
     stored["quats"] = stored["quats"] / np.maximum(np.linalg.norm(stored["quats"], axis=1, keepdims=True), 1e-12)
     stored["opacity_logits"] = stored["opacity_logits"].clip(-_MOST_LOGIT, _MOST_LOGIT)
-    held = held_rows(gaussians["opacity_logits"], config)
-    stored = {name: values[held] for name, values in stored.items()}
-    allowed = _allowed_errors(stored, config.appearance_size == 4, look)
     tensors: dict[str, NDArray[Any]] = {}
+
+    def add(
+        name: str, values: Floats, bits: int, centered: bool, most: NDArray[np.floating] | None, starts: Sequence[int]
+    ) -> None:
+        if most is None:  # of features: half a step of their range, as only the field knows more
+            largest = np.maximum.reduceat(np.abs(values), starts)
+            most = np.repeat(largest / ((1 << bits) - 2) * 1.01, np.diff([*starts, len(values)]), axis=0)
+        whole, ranges, outliers, exact = quantize(values, bits, finer * most, centered=centered, starts=starts)
+        tensors.update({name: whole, f"{name}.range": ranges})
+        if len(outliers):
+            tensors.update({f"{name}.outliers": outliers, f"{name}.exact": exact})
+
+    allowed = _allowed_errors(stored, config.appearance_size == 4, look)
     for name, (_, bits, centered) in formats.items():
-        values = stored[name]
-        most = allowed[name] if name in allowed else _half_step(values, bits)
-        tensors |= _named(f"gaussians.{name}", quantize(values, bits, finer * most, centered=centered))
-    starts = _table_starts(config)
+        add(f"gaussians.{name}", stored[name], bits, centered, allowed.get(name), [0])
     for name in _field_shapes(config):
         values = field[name]
         if name.endswith(".table"):
-            most = finer * _half_step(values, _TABLE_BITS, starts)
-            tensors |= _named(f"field.{name}", quantize(values, _TABLE_BITS, most, centered=True, starts=starts))
+            add(f"field.{name}", values, _TABLE_BITS, True, None, _table_starts(config))
         else:
             with np.errstate(over="ignore"):  # refused when it is written
                 tensors[f"field.{name}"] = values if name == _EXACT else values.astype(np.float16)
@@ -142,7 +149,11 @@ def _allowed_errors(
 ) -> dict[str, NDArray[np.floating]]:
     """Return the largest errors of a Gaussian's values that are hardly seen, (N, 1 or columns) by name."""
     means, scales = stored["means"].astype(np.float64), np.exp(stored["log_scales"].astype(np.float64))
-    pixel = _pixels(means, look)[:, None]
+    pixel = np.zeros((len(means), 1))  # its width at a Gaussian, where a camera about the focus is nearest
+    if look is not None:
+        camera, away = look.camera, np.linalg.norm(means - look.focus, axis=1, keepdims=True)
+        distance = float(np.linalg.norm(camera.position - look.focus))
+        pixel = np.maximum(away - distance, _NEAREST * distance) * (camera.height / camera.K[1, 1] / _PIXELS)
     shift = np.maximum(_SHIFT * np.sort(scales, axis=1)[:, 1:2], _SHIFT_PIXELS * pixel)
     ratio = CONSTANTS["DILATION"] * (pixel / scales) ** 2
     opacity = 0.5 + 0.5 * np.tanh(0.5 * stored["opacity_logits"].astype(np.float64))
@@ -156,29 +167,6 @@ def _allowed_errors(
         "sh_dc": _COLOR / CONSTANTS["SH_C0"] * np.maximum(color, 1),
         "sh_rest": np.array([[_HARMONIC]]),
     }
-
-
-def _half_step(values: Floats, bits: int, starts: Sequence[int] = (0,)) -> NDArray[np.floating]:
-    """Return the largest errors (N, columns) of features: half a step of their range, as only the field knows more."""
-    largest = np.maximum.reduceat(np.abs(values), starts)
-    return np.repeat(largest / ((1 << bits) - 2) * 1.01, np.diff([*starts, len(values)]), axis=0)
-
-
-def _pixels(means: NDArray[np.float64], look: InitialView | None) -> NDArray[np.float64]:
-    """Return the width (N,) of a pixel at Gaussians, world units, where a camera about the focus is nearest."""
-    if look is None:
-        return np.zeros(len(means))
-    camera = look.camera
-    distance = float(np.linalg.norm(camera.position - look.focus))
-    nearest = np.maximum(np.linalg.norm(means - look.focus, axis=1) - distance, _NEAREST * distance)
-    return nearest * (camera.height / camera.K[1, 1] / _PIXELS)
-
-
-def _named(name: str, quantized: Quantized) -> dict[str, NDArray[Any]]:
-    tensors = {name: quantized.whole, f"{name}.range": quantized.ranges}
-    if len(quantized.outliers):
-        tensors |= {f"{name}.outliers": quantized.outliers, f"{name}.exact": quantized.exact}
-    return tensors
 
 
 def _table_starts(config: FieldConfig) -> list[int]:

@@ -9,9 +9,6 @@ from lapgs_wgpu.splat.constants import CONSTANTS
 
 Method = Literal["static", "mlp", "hexplane", "grid4d", "laplacian"]
 FieldKind = Literal[Method, "own"]
-Motion = Literal["laplacian", "mlp"]
-NegativeScales = Literal["floor", "mirror"]
-Appearance = Literal["none", "color", "color+opacity"]
 MIN_SCALE = CONSTANTS["MIN_SCALE"]
 TEMPORAL_AXES = ((0, 1, TIME), (1, 2, TIME), (0, 2, TIME))  # of the temporal hash grids
 GEOMETRY = (4, 3, 4, 3)  # outputs of the grid fields' geometry heads: turn, shift, quaternion, scale
@@ -66,7 +63,7 @@ class FieldConfig(Options):
         "fraction of the space-time grids' time axis that the clip takes, in its middle", 0.9, above=0, at_most=1
     )
     temporal_hash: bool = option("use the space-time hash grids (grid4d, laplacian)", True)
-    motion: Motion = option(
+    motion: Literal["laplacian", "mlp"] = option(
         "how laplacian decodes motion; laplacian: as a sum of sinusoids, the motion spectrum; mlp: from features and "
         "time",
         "laplacian",
@@ -92,12 +89,14 @@ class FieldConfig(Options):
         at_least=0,
         at_most=256,
     )
-    negative_scales: NegativeScales = option(
+    negative_scales: Literal["floor", "mirror"] = option(
         "what becomes of a Gaussian's size that motion makes negative; mirror: its magnitude counts (Grid4D); floor: "
         "1e-7 does",
         "floor",
     )
-    appearance: Appearance = option("what laplacian changes over time besides geometry", "color")
+    appearance: Literal["none", "color", "color+opacity"] = option(
+        "what laplacian changes over time besides geometry", "color"
+    )
 
     @property
     def dynamics_size(self) -> int:

@@ -1,8 +1,8 @@
 """The grid fields' decoder in torch: one function of features, its gradient written out.
 
-motion/passes/grid_field_passes is the same for kernels. Gaussians are decoded in blocks, each by one thread: torch shares
-single operators among threads, which takes longer than it saves where they are short. Blocks, and with them the bits of
-results, follow from the number of Gaussians and not from that of the threads.
+motion/passes/grid_field_passes is the same for kernels. Gaussians are decoded in blocks, each by one thread: torch
+shares single operators among threads, which takes longer than it saves where they are short. Blocks, and with them the
+bits of results, follow from the number of Gaussians and not from that of the threads.
 """
 
 import os

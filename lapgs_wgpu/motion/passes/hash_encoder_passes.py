@@ -139,6 +139,7 @@ class HashEncoderPasses:
         if not points.count:
             return
         d_slices, blocks = self._pool.array("d_slices", (self._slice_entries, 2)), self._blocks(points)
+        cores = os.cpu_count() or 1
         commands.clear(d_slices)
         sums = floats = self._lookups(d_slices, d_tables)
         of_all: dict[str, DeviceArray] = {"grid": blocks[0][2]}
@@ -150,7 +151,9 @@ class HashEncoderPasses:
             arrays = {"points": points.array.rows(first, count), "d_encoding": d_encoding.rows(first, count)}
             for levels, target in sums:
                 kernel = Kernel.get(self._device, "hashgrid_bwd", **levels.defines, LANE_LEVELS=self._lane_levels)
-                groups = _shared(levels.count) if self._lane_levels else -(-count // 64) * levels.count
+                groups = -(-count // 64) * levels.count
+                if self._lane_levels:  # as many for each core, with at most eight levels in each
+                    groups = min(levels.count, -(-levels.count // (8 * cores)) * cores)
                 arrays |= {"levels": levels.array, "d_features": target, "d_fixed": target}
                 commands.run(kernel, groups, of_all | arrays | {"grid": grid})
                 commands.flush()  # all lookups together may take longer than a watchdog allows
@@ -172,12 +175,6 @@ class HashEncoderPasses:
             gradient = d_encoding.rows(first, count)
             commands.dispatch(kernel, -(-count * self._row // 4096), grid=grid, d_encoding=gradient, largest=largest)
         return largest
-
-
-def _shared(levels: int) -> int:
-    """Return the number of workgroups whose lanes own levels: as many for each core, at most eight levels in each."""
-    cores = os.cpu_count() or 1
-    return min(levels, -(-levels // (8 * cores)) * cores)
 
 
 def _level_words(grid: GridShape, first_number: int, first_sliced: int) -> NDArray[np.uint32]:

@@ -5,7 +5,6 @@ What does not depend on the time is computed once. A time then costs the tempora
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -26,17 +25,6 @@ _CANONICAL = 16  # deform.wgsl: floats of a Gaussian before its still features
 _BLOCK_BYTES = 128 << 20  # of the features that a dispatch reads: WebGPU's default limit of a binding
 # Where deform.wgsl has the outputs of the heads among its floats: turn, shift, quaternion, scale; color, opacity.
 _PLACES = np.array([*range(4), 8, 9, 10, *range(4, 8), 12, 13, 14, 16, 17, 18, 11])
-
-
-@dataclass(frozen=True)
-class _Block:
-    """The range of Gaussians of one dispatch, and its inputs."""
-
-    first: int
-    count: int
-    points: DeviceArray  # (count, 4)
-    still: DeviceArray  # (count, 16 + still features)
-    moving: DeviceArray  # (count, dynamics and temporal features)
 
 
 class GridFieldPlayback:
@@ -64,7 +52,10 @@ class GridFieldPlayback:
         self._moving_quads = -(-(self._first_temporal + sum(grid.features for grid in grids)) // 4)
         row = max(_CANONICAL + 4 * self._still_quads, 4 * self._moving_quads)
         size, count = _BLOCK_BYTES // (4 * row) // _LANES * _LANES, len(gaussians["means"])
-        self._blocks = [self._block(gaussians, first, min(size, count - first)) for first in range(0, count, size)]
+        # By their first Gaussian: the inputs of each dispatch.
+        self._blocks = {
+            first: self._block(gaussians, first, min(size, count - first)) for first in range(0, count, size)
+        }
         row = 4 * self._moving_quads
         self._temporal = HashEncoderPasses(device, grids, config.bound, row=row, column=self._first_temporal)
         names = [f"temporal_grids.{i}.table" for i in range(len(grids))]
@@ -75,7 +66,9 @@ class GridFieldPlayback:
         self._stream_at = len(heads)
         self._weights = self._pool.upload("weights", np.concatenate([heads, self._stream()]))
 
-    def _block(self, gaussians: Mapping[str, Floats], first: int, count: int) -> _Block:
+    def _block(self, gaussians: Mapping[str, Floats], first: int, count: int) -> dict[str, DeviceArray]:
+        """Upload what a dispatch reads: points (count, 4), still (count, 16 + still features), and moving (count,
+        dynamics and temporal features)."""
         g = {name: array[first : first + count] for name, array in gaussians.items()}
         points = np.zeros((count, 4), np.float32)
         points[:, :3] = g["means"]
@@ -89,20 +82,21 @@ class GridFieldPlayback:
         if self._config.dynamics_size:
             moving[:, : self._config.dynamics_size] = g["dynamics"]
         named = {"points": points, "still": still, "moving": moving}
-        return _Block(first, count, **{name: self._pool.upload(f"{name} from {first}", a) for name, a in named.items()})
+        return {name: self._pool.upload(f"{name} from {first}", array) for name, array in named.items()}
 
     def _encode_static(self, entries: Floats) -> None:
         grid, row = static_grid(self._config), _CANONICAL + 4 * self._still_quads
         encoder = HashEncoderPasses(self._device, [grid], self._config.bound, row=row, column=_CANONICAL)
         table = DeviceArray.upload(self._device, "static table", entries)  # not in the pool, since it is needed once
         with Commands(self._device) as commands:
-            for number, block in enumerate(self._blocks):
-                encoder.encode(commands, PointSet(number, block.points, block.count, float), [table], block.still)
+            for first, block in self._blocks.items():
+                points = PointSet(first, block["points"], block["points"].shape[0], float)
+                encoder.encode(commands, points, [table], block["still"])
 
     def static_features(self) -> Floats:
         """Return the spatial features H_s, (N, F): the static grid's at the canonical means."""
-        parts = [block.still.read()[:, _CANONICAL : _CANONICAL + self._static] for block in self._blocks]
-        return np.concatenate(parts)
+        columns = slice(_CANONICAL, _CANONICAL + self._static)
+        return np.concatenate([block["still"].read()[:, columns] for block in self._blocks.values()])
 
     # Weights ---------------------------------------------------------------------------------------------------------
 
@@ -161,12 +155,12 @@ class GridFieldPlayback:
         sizes = {"rounds": self._rounds, "still_quads": self._still_quads, "moving_quads": self._moving_quads}
         sizes |= {"stream": self._stream_at, "sh_stored": out.sh.shape[1]}
         with Commands(self._device) as commands:
-            for number, block in enumerate(self._blocks):
-                points = PointSet(number, block.points, block.count, partial(self._config.grid_time, t))
-                self._temporal.encode(commands, points, self._tables, block.moving)
-                arrays = {name: array.rows(block.first, block.count) for name, array in out.arrays().items()}
-                arrays |= {"colors": arrays["sh"], "still": block.still, "moving": block.moving}
-                arrays["deform"] = self._pool.constant(kernel.uniform("Deform", gaussians=block.count, **sizes))
-                arrays["weights"] = self._weights
-                commands.run(kernel, -(-block.count // (_LANES * self._defines["POINTS"])), arrays)
+            for first, block in self._blocks.items():
+                count = block["points"].shape[0]
+                points = PointSet(first, block["points"], count, partial(self._config.grid_time, t))
+                self._temporal.encode(commands, points, self._tables, block["moving"])
+                arrays = block | {name: array.rows(first, count) for name, array in out.arrays().items()}
+                deform = self._pool.constant(kernel.uniform("Deform", gaussians=count, **sizes))
+                arrays |= {"colors": arrays["sh"], "weights": self._weights, "deform": deform}
+                commands.run(kernel, -(-count // (_LANES * self._defines["POINTS"])), arrays)
                 commands.flush()  # all blocks together may take longer than a watchdog allows
