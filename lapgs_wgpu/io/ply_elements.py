@@ -201,18 +201,13 @@ def read_colors(ply: PlyFile, vertex: Element) -> Floats | None:
     names = {name.lower(): name for name in vertex.properties}
     if {"f_dc_0", "f_dc_1", "f_dc_2"} <= set(names):
         values = ply.columns(vertex, [names[f"f_dc_{channel}"] for channel in range(3)]) * np.float32(SH_C0) + 0.5
-        return _clipped(values)
-    found = next((triple for triple in _TRIPLES if set(triple) <= set(names)), None)
-    if found is None:
+    elif found := next((triple for triple in _TRIPLES if set(triple) <= set(names)), None):
+        chosen = [names[name] for name in found]
+        values = ply.columns(vertex, chosen)
+        brightest = np.max(values, where=np.isfinite(values), initial=0.0)
+        fractions = all(vertex.properties[name].kind == "f" for name in chosen)
+        if not (fractions and brightest < 2):  # some are a little above 1
+            values /= np.float32(255 if brightest < 256 else 65535)
+    else:
         return None
-    chosen = [names[name] for name in found]
-    values = ply.columns(vertex, chosen)
-    brightest = np.max(values, where=np.isfinite(values), initial=0.0)
-    fractions = all(vertex.properties[name].kind == "f" for name in chosen)
-    if fractions and brightest < 2:  # some are a little above 1
-        return _clipped(values)
-    return _clipped(values / np.float32(255 if brightest < 256 else 65535))
-
-
-def _clipped(values: Floats) -> Floats:
     return np.nan_to_num(values, nan=0.5).clip(0, 1).astype(np.float32, copy=False)

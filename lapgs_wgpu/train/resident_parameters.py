@@ -73,9 +73,9 @@ class ResidentParameters:
     steps: by name of a tensor, how many steps have moved it.
     """
 
-    def __init__(self, learners: Learners, field: GridFieldPasses | None) -> None:
+    def __init__(self, learners: Learners, weights: GridFieldPasses | None) -> None:
         scene = learners.scene
-        self._device, self._pool, self._field = scene.device, BufferPool(scene.device), field
+        self._device, self._pool, self._weights = scene.device, BufferPool(scene.device), weights
         self._optimizer, self._frequencies = learners.optimizer, learners.frequencies
         tensors = dict(scene.field.named_parameters()) if scene.field is not None else {}
         self._tensors: dict[str, Mapping[str, Tensor]] = {"gaussians": scene.parameters, "field": tensors}  # by part
@@ -116,14 +116,14 @@ class ResidentParameters:
             Block("geometry", (n, GEOMETRY_FLOATS), None, geometry, moving=False),
             Block("sh", (n, SH_FLOATS), None, colors, moving=False),
         ]
-        if self._field is not None:
-            size = self._field.dynamics
+        if self._weights is not None:
+            size = self._weights.dynamics
             dynamics = {"dynamics": (every, slice(0, size))} if "dynamics" in gaussians else {}
             blocks.append(Block("beside", (n, size + 1), None, dynamics, ones=True))
         return blocks
 
     def _field_layout(self) -> list[Block]:
-        if self._field is None:
+        if self._weights is None:
             return []
         tensors, every = self._tensors["field"], slice(None)
         blocks = [
@@ -131,7 +131,7 @@ class ResidentParameters:
             for name, table in tensors.items()
             if name.endswith(".table")
         ]
-        places, shape = self._field.places, (self._field.count, 1)
+        places, shape = self._weights.places, (self._weights.count, 1)
         rows = {name: (slice(first, first + tensors[name].numel()), every) for name, first in places.items()}
         moved = places.get(FREQUENCIES)
         return [*blocks, Block("weights", shape, "mlp", rows, moved=moved)]
@@ -187,7 +187,7 @@ class ResidentParameters:
         """What the field computes with (kind "value"), or its gradients; the Gaussians' own for a scene without one."""
         tables = [block.arrays[kind] for name, block in self.blocks.items() if name.endswith(".table")]
         geometry = self.blocks["geometry"].arrays[kind]
-        if self._field is None:
+        if self._weights is None:
             return FieldArrays(geometry, geometry, [], geometry)
         return FieldArrays(geometry, self.blocks["beside"].arrays[kind], tables, self.flat_weights(kind))
 
@@ -240,10 +240,10 @@ class ResidentParameters:
     def _record_frequencies(
         self, commands: Commands, guard: DeviceArray, rates_of: Callable[[], Mapping[str, float]]
     ) -> None:
-        assert self._field is not None
+        assert self._weights is not None
         assert self._frequencies is not None
-        kernel, config = Kernel.get(self._device, "adam_frequencies"), self._field.config
-        given = {name: self._field.places[f"motion.{name}"] for name in ("alpha", "beta", "frequencies")}
+        kernel, config = Kernel.get(self._device, "adam_frequencies"), self._weights.config
+        given = {name: self._weights.places[f"motion.{name}"] for name in ("alpha", "beta", "frequencies")}
         given |= {"width": config.width, "components": config.components}
         bounds = {"limit": self._frequencies.limit, "largest": LARGEST_FREQUENCY_STEP}
         bounds |= {"floor": VARIANCE_FLOOR, "spread": VARIANCE_SPREAD}
