@@ -98,7 +98,7 @@ def fit_field(
         loss, distance = torch.zeros(()), 0.0
         first_time, *others = (float(times[at]) for at in now)
         samples = TimeSamples(torch.arange(len(means)), tuple(others)) if others else None
-        for at, move in zip(now, field.at_times(means, first_time, dynamics, time_samples=samples), strict=True):
+        for at, move in zip(now, field.at_times(means, first_time, dynamics, None, samples), strict=True):
             seen, targets = supported[at, asked], paths[at, asked].lerp(paths[at, other], way)
             moved = move.apply_to_means(means)
             squared = (moved - torch.cat([targets, means[len(asked) :]])).square().sum(dim=1)

@@ -1,7 +1,6 @@
 """The 4D scene: canonical Gaussians and the field that moves them, as stored in a checkpoint."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -28,13 +27,10 @@ from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import Rendering, rasterize
 from lapgs_wgpu.splat.rotation import quat_multiply
 
+Floats = NDArray[np.floating]
 
-def isotropic_rows(
-    points: NDArray[np.floating[Any]],
-    colors: NDArray[np.floating[Any]],
-    scales: NDArray[np.floating[Any]],
-    opacity: float,
-) -> dict[str, Tensor]:
+
+def isotropic_rows(points: Floats, colors: Floats, scales: Floats, opacity: float) -> dict[str, Tensor]:
     """The parameters of isotropic Gaussians that stand still, as `Scene4D` has them; arguments as for `from_points`."""
     n = len(points)
     return {
@@ -106,9 +102,9 @@ class Scene4D:
 
     @staticmethod
     def from_points(
-        points: NDArray[np.floating[Any]],
-        colors: NDArray[np.floating[Any]],
-        scales: NDArray[np.floating[Any]],
+        points: Floats,
+        colors: Floats,
+        scales: Floats,
         field_config: FieldConfig,
         *,
         opacity: float = 0.1,

@@ -45,9 +45,7 @@ class FieldConfig(Options):
         above=0,
         below=1e6,
     )
-    static: HashConfig = option(
-        "spatial hash grid (grid4d, laplacian)", HashConfig(16, (16, 16, 16), (2048, 2048, 2048))
-    )
+    static: HashConfig = option("spatial hash grid (grid4d, laplacian)", HashConfig())
     temporal: HashConfig = option(
         "space-time hash grids, two axes and time (grid4d, laplacian)", HashConfig(32, (8, 8, 8), (32, 32, 16))
     )

@@ -43,12 +43,7 @@ class Field(nn.Module):
     """Base class of fields."""
 
     def at_times(
-        self,
-        means: Tensor,
-        t: float,
-        dynamics: Tensor | None = None,
-        nearby: Nearby | None = None,
-        time_samples: TimeSamples | None = None,
+        self, means: Tensor, t: float, dynamics: Tensor | None, nearby: Nearby | None, time_samples: TimeSamples | None
     ) -> "list[Deformation]":
         """Return the deformation at time t as `forward` does, and that of `time_samples` at each of its times."""
         moves = [self(means, t, dynamics, nearby)]

@@ -55,15 +55,10 @@ class GridField(Field):
         self, means: Tensor, t: float, dynamics: Tensor | None = None, nearby: Nearby | None = None
     ) -> Deformation:
         """See motion/fields/deformation.py."""
-        return self.at_times(means, t, dynamics, nearby)[0]
+        return self.at_times(means, t, dynamics, nearby, None)[0]
 
     def at_times(
-        self,
-        means: Tensor,
-        t: float,
-        dynamics: Tensor | None = None,
-        nearby: Nearby | None = None,
-        time_samples: TimeSamples | None = None,
+        self, means: Tensor, t: float, dynamics: Tensor | None, nearby: Nearby | None, time_samples: TimeSamples | None
     ) -> list[Deformation]:
         """See motion/fields/deformation.py. All are encoded together, which takes much less time than apart."""
         places, decoded = [(means, self.config.grid_time(t))], [(t, dynamics)]

@@ -97,11 +97,9 @@ class HashEncoder:
 class _Encode(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, encoder: HashEncoder, places: Sequence[Place], *_: Tensor) -> tuple[Tensor, ...]:
-        ctx.encoder, ctx.times = encoder, [time for _, time in places]
-        ctx.save_for_backward(*[points for points, _ in places])
+        ctx.encoder, ctx.places = encoder, places
         return tuple(encoder.encode(places))
 
     @staticmethod
     def backward(ctx: Any, *d_encodings: Tensor) -> tuple[Tensor | None, ...]:
-        places = list(zip(ctx.saved_tensors, ctx.times, strict=True))
-        return (None, None, *ctx.encoder.backward(places, d_encodings))
+        return (None, None, *ctx.encoder.backward(ctx.places, d_encodings))
