@@ -66,27 +66,6 @@ class Decoding(NamedTuple):
     outputs: DeviceArray
 
 
-class _Product(NamedTuple):
-    """An addend of the layers: the first `columns` columns of an input, times a matrix (channels, columns) of the
-    weights, give `channels` channels from `channel` on. first, stride: of that matrix. add: not the first of these."""
-
-    input: str
-    columns: int
-    channel: int
-    channels: int
-    first: int
-    stride: int
-    add: bool = False
-
-    def weights(self, array: DeviceArray) -> Matrix:
-        """The matrix in the array of weights, or its place in that of their gradients."""
-        return Matrix(array, self.channels, self.columns, self.stride, self.first)
-
-    def given(self, inputs: Mapping[str, DeviceArray], first: int, count: int) -> Matrix:
-        """The input's columns in some rows."""
-        return Matrix.of(inputs[self.input].rows(first, count)).from_column(0, self.columns)
-
-
 class GridFieldPasses:
     """Records the passes of a field that `decodes_on_device`; the decoder's, a block of Gaussians after another.
 
@@ -117,12 +96,14 @@ class GridFieldPasses:
         self._block = max(64, min(_BLOCK, device.max_binding // (4 * self._channels) // 64 * 64))
         static, moving = static_grid(config).features, sum(grid.features for grid in temporal_grids(config))
         first, row, size = self.places["temporal.weight"], shapes["temporal.weight"][1], self.dynamics
+        # What is added to the layers: the first columns of an input, from a channel on, times a matrix of the weights
+        # (channels, columns); of it also the stride and the first number.
         products = [
-            _Product("static", static, 0, placed, self.places["spatial.weight"], static),
-            _Product("beside", size, placed, width, first, row),
-            _Product("temporal", moving, placed, width, first + size, row, add=size > 0),
+            ("static", 0, (placed, static, static, self.places["spatial.weight"])),
+            ("beside", placed, (width, size, row, first)),
+            ("temporal", placed, (width, moving, row, first + size)),
         ]
-        self._products = [each for each in products if each.columns]
+        self._products = [(name, channel, place) for name, channel, place in products if place[1]]
 
     def decode(
         self, commands: Commands, number: int, arrays: FieldArrays, t: Time, sampling: Sampling | None = None
@@ -173,10 +154,11 @@ class GridFieldPasses:
             self._product(commands, d, Matrix.of(decoding.heads), features)
             self._gate("gate_bwd", commands, count, weights, d_features=features.array, layers=layers.array)
             split(commands, layers.transpose, ones, of_layers, add=True)
-            for each in self._products:
-                own, given = layers.from_column(each.channel, each.channels), each.given(inputs, first, count)
-                split(commands, own.transpose, given, each.weights(d_weights), add=True)
-                self._product(commands, own, each.weights(weights), each.given(d_inputs, first, count))
+            for name, channel, place in self._products:
+                own, matrix = layers.from_column(channel, place[0]), Matrix(weights, *place)
+                given, d_given = (_columns(each[name], first, count, matrix) for each in (inputs, d_inputs))
+                split(commands, own.transpose, given, Matrix(d_weights, *place), add=True)
+                self._product(commands, own, matrix, d_given)
         bound = self._bound(weights, decoding.time, number) | {"d_weights": d_weights}
         bound |= {"d_series": self._pool.array("d_series", (self.config.width,))}
         bound |= {"d_heads": d_heads, "d_biases": d_biases}
@@ -263,10 +245,10 @@ class GridFieldPasses:
         features = Matrix.of(self._pool.array("features", (count, self._placed)))
         if len(self._products) == 1:
             commands.clear(layers.array)  # the temporal channels have nothing but biases
-        for each in self._products:
-            own = layers.from_column(each.channel, each.channels)
-            given, matrix = each.given(inputs, first, count), each.weights(weights).transpose
-            self._product(commands, given, matrix, own, add=each.add)
+        for name, channel, place in self._products:
+            own, matrix = layers.from_column(channel, place[0]), Matrix(weights, *place)
+            given, more = _columns(inputs[name], first, count, matrix), name == "temporal" and self.dynamics > 0
+            self._product(commands, given, matrix.transpose, own, add=more)
         self._gate("gate", commands, count, weights, layers=layers.array, features=features.array)
         return layers, features
 
@@ -275,3 +257,8 @@ class GridFieldPasses:
         biases = self.places["spatial.bias"]
         uniform = self._pool.constant(kernel.uniform("Gate", gaussians=count, width=width, biases=biases))
         commands.dispatch(kernel, -(-count * width // 64), gate=uniform, weights=weights, **arrays)
+
+
+def _columns(array: DeviceArray, first: int, count: int, matrix: Matrix) -> Matrix:
+    """Of some rows of an input the columns that a matrix of the weights takes."""
+    return Matrix.of(array.rows(first, count)).from_column(0, matrix.columns)
