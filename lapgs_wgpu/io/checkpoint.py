@@ -6,15 +6,14 @@ The element `lapgs4d` follows the Gaussians of a 3DGS .ply; its rows of one uint
 
 import re
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.ply import GaussianSnapshot, read_foreign, read_gaussians, write_ply
 from lapgs_wgpu.io.ply_elements import PathLike, PlyFile, open_ply
-from lapgs_wgpu.io.safetensors_file import pack_tensors, unpack_tensors
+from lapgs_wgpu.io.safetensors_file import Array, Tensors, pack_tensors, unpack_tensors
 
 VERSION = 1
 _ELEMENT = "lapgs4d"
@@ -25,13 +24,11 @@ class Checkpoint(NamedTuple):
     metadata what `read_foreign` finds in them."""
 
     still: GaussianSnapshot
-    tensors: dict[str, NDArray[Any]]
+    tensors: dict[str, Array]
     metadata: dict[str, str]
 
 
-def write_checkpoint(
-    path: PathLike, still: GaussianSnapshot, tensors: Mapping[str, NDArray[Any]], metadata: Mapping[str, str]
-) -> None:
+def write_checkpoint(path: PathLike, still: GaussianSnapshot, tensors: Tensors, metadata: Mapping[str, str]) -> None:
     """Write a checkpoint. Atomic; equal arguments give equal bytes, on every machine.
 
     tensors: float, int or uint arrays of any shape. Raises InputError when the file cannot be written or a value is
@@ -59,7 +56,7 @@ def read_checkpoint(path: PathLike) -> Checkpoint:
         return Checkpoint(still, {}, metadata)
 
 
-def _read_motion(ply: PlyFile) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
+def _read_motion(ply: PlyFile) -> tuple[dict[str, Array], dict[str, str]]:
     element, where = ply.elements[_ELEMENT], f"{ply.path}: element {_ELEMENT}"
     pattern = rf"^{_ELEMENT} v([0-9]{{1,9}}) safetensors ([0-9]{{1,18}})$"
     declared = re.search(pattern, "\n".join(ply.comments), re.MULTILINE)

@@ -8,13 +8,10 @@ import struct
 import zlib
 from collections.abc import Mapping
 from contextlib import suppress
-from typing import Any
-
-from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.regular_file import PathLike, open_regular
-from lapgs_wgpu.io.safetensors_file import pack_tensors, unpack_tensors
+from lapgs_wgpu.io.safetensors_file import Array, Tensors, pack_tensors, unpack_tensors
 
 MAGIC = b"lapgs4d\n"
 VERSION = 2  # 1 has no outliers, and whole numbers alone
@@ -31,7 +28,7 @@ def lapgs_bytes(path: PathLike) -> bytes | None:
     return None
 
 
-def pack_lapgs(tensors: Mapping[str, NDArray[Any]], metadata: Mapping[str, str]) -> bytes:
+def pack_lapgs(tensors: Tensors, metadata: Mapping[str, str]) -> bytes:
     """The bytes of a compact scene; equal arguments give equal bytes on every machine with the same zlib.
 
     Raises InputError where a value is NaN or infinite, or where the reader would refuse the size.
@@ -49,7 +46,7 @@ def pack_lapgs(tensors: Mapping[str, NDArray[Any]], metadata: Mapping[str, str])
     return _HEADER.pack(MAGIC, version, len(content)) + packed
 
 
-def unpack_lapgs(data: bytes, where: str) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
+def unpack_lapgs(data: bytes, where: str) -> tuple[dict[str, Array], dict[str, str]]:
     """Tensors and metadata of a compact scene. Memory: twice what it unpacks to, at most MAX_BYTES.
 
     where: begins the message of an InputError, for data that is damaged or of a later version.

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from lapgs_wgpu.errors import InputError, shown
 
 Array = NDArray[Any]
+Tensors = Mapping[str, Array]
 
 MAX_HEADER_BYTES = 1 << 20
 _DTYPES = {
@@ -26,7 +27,7 @@ _NAMES = {np.dtype(code): name for name, code in _DTYPES.items()}
 _METADATA = "__metadata__"
 
 
-def pack_tensors(tensors: Mapping[str, Array], metadata: Mapping[str, str]) -> list[bytes | memoryview]:
+def pack_tensors(tensors: Tensors, metadata: Mapping[str, str]) -> list[bytes | memoryview]:
     """Return the consecutive buffers of a safetensors file.
 
     Tensors are ordered by decreasing item size, then by name, so that each is aligned; metadata is ordered by key.

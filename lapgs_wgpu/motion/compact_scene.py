@@ -6,13 +6,13 @@ docs/format.md has the tensors; the web page (viewer/web) reads the same file.
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.initial_view import InitialView
+from lapgs_wgpu.io.safetensors_file import Array, Tensors
 from lapgs_wgpu.motion.fields.config import MIN_SCALE, FieldConfig, static_grid, temporal_grids
 from lapgs_wgpu.motion.fields.parameter_shapes import Shapes, parameter_shapes
 from lapgs_wgpu.motion.quantize import Quantized, dequantize, quantize
@@ -64,7 +64,7 @@ def compress(
     sh_degree: int,
     look: InitialView | None,
     finer: float,
-) -> dict[str, NDArray[Any]]:
+) -> dict[str, Array]:
     """Return the tensors of a compact scene, without Gaussians that are too faint to be drawn at any time.
 
     gaussians: as SceneFile has them, and "static_features" (N, F) where the scene moves. field: as SceneFile has it.
@@ -77,7 +77,7 @@ def compress(
     stored["log_scales"] = np.maximum(stored["log_scales"], np.float32(math.log(MIN_SCALE)))
     stored["quats"] = stored["quats"] / np.maximum(np.linalg.norm(stored["quats"], axis=1, keepdims=True), 1e-12)
     stored["opacity_logits"] = stored["opacity_logits"].clip(-_MOST_LOGIT, _MOST_LOGIT)
-    tensors: dict[str, NDArray[Any]] = {}
+    tensors: dict[str, Array] = {}
 
     def add(
         name: str, values: Floats, bits: int, centered: bool, most: NDArray[np.floating] | None, starts: Sequence[int]
@@ -112,9 +112,7 @@ def held_rows(opacity_logits: Floats, config: FieldConfig) -> NDArray[np.integer
     return np.flatnonzero(held) if held.any() else np.zeros(1, int)
 
 
-def expand(
-    tensors: Mapping[str, NDArray[Any]], config: FieldConfig, sh_degree: int, where: str
-) -> tuple[Arrays, Arrays]:
+def expand(tensors: Tensors, config: FieldConfig, sh_degree: int, where: str) -> tuple[Arrays, Arrays]:
     """Gaussians, with "static_features" where the scene moves, and field, of the tensors of a compact scene.
 
     Shapes are SceneFile's; the field lacks its static table. Raises InputError, whose message begins with `where`.
@@ -174,9 +172,7 @@ def _table_starts(config: FieldConfig) -> list[int]:
     return [level.first for level in grids[0].levels] if grids else [0]
 
 
-def tensor_of(
-    tensors: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, ...], where: str, *codes: str
-) -> NDArray[Any]:
+def tensor_of(tensors: Tensors, name: str, shape: tuple[int, ...], where: str, *codes: str) -> Array:
     """Return a tensor of a file, of a type with one of these codes, if there are any. Raises InputError."""
     array = tensors.get(name)
     if array is None:
@@ -190,9 +186,7 @@ def tensor_of(
     return array
 
 
-def _columns(
-    tensors: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, ...], where: str, starts: Sequence[int] = (0,)
-) -> Floats:
+def _columns(tensors: Tensors, name: str, shape: tuple[int, ...], where: str, starts: Sequence[int] = (0,)) -> Floats:
     """Return a dequantized tensor (rows, columns). shape: (columns, rows)."""
     whole = tensor_of(tensors, name, shape, where, "u1", "u2", "f4")
     ranges = tensor_of(tensors, f"{name}.range", (len(starts), shape[0], 2), where, "f4")

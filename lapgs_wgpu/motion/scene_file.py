@@ -16,6 +16,7 @@ from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.io.lapgs_file import lapgs_bytes, pack_lapgs, unpack_lapgs
 from lapgs_wgpu.io.regular_file import PathLike
 from lapgs_wgpu.io.safe_json_toml import parse_json
+from lapgs_wgpu.io.safetensors_file import Tensors
 from lapgs_wgpu.motion.compact_scene import compress, expand, tensor_of
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
@@ -141,9 +142,7 @@ def _read_header(metadata: Mapping[str, str], path: PathLike) -> dict[str, Any]:
     return described | {"metadata": others}
 
 
-def _float32(
-    tensors: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, ...], path: PathLike
-) -> NDArray[np.float32]:
+def _float32(tensors: Tensors, name: str, shape: tuple[int, ...], path: PathLike) -> NDArray[np.float32]:
     array = tensor_of(tensors, name, shape, str(path))
     values = array.astype(np.float32, copy=False)
     if values is not array and not np.isfinite(values).all():  # all values are finite before the conversion
