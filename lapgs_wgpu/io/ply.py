@@ -18,7 +18,6 @@ from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.io.ply_elements import BAD_SHARE, SH_C0, Element, Floats, PathLike, PlyFile, read_colors
 
 MAX_LOG_SCALE = 44.0  # exp(2 * 44) still fits in float32: the variance is finite
-_ANTIALIASED = "SplatRenderMode: mip"  # comment of files whose Gaussians are drawn antialiased
 _MOTION = re.compile(  # words of a property's name that speak of time or of motion
     "(.*_)?(trbf|motion|omega|velocity|vel|v[xyz]|rot_r|t|time|timestamp|duration|lifetime|poly|fourier|traj|deform|temporal)"
     "(_.*)?",
@@ -81,14 +80,15 @@ def write_ply(
     n, rest = len(still), still.sh.shape[1] - 1
     if n == 0:
         raise InputError(f"{path}: not written, because it would hold 0 Gaussians; at least 1 is needed")
-    higher = np.zeros((n, 3, 15), np.float32)  # all of red, then green, then blue
-    higher[:, :, :rest] = still.sh[:, 1:].transpose(0, 2, 1)
-    normals, logits = np.zeros((n, 3), np.float32), still.opacity_logits[:, None]  # 3DGS leaves normals at 0
-    parts = [still.means, normals, still.sh[:, 0], higher.reshape(n, 45), logits, still.log_scales, still.quats]
-    rows = np.concatenate(parts, axis=1, dtype="<f4")
+    rows = np.zeros((n, 62), "<f4")  # 3DGS leaves the normals at 0
+    means, _, dc, others, opacities, scales, quats = np.split(rows, np.cumsum([3, 3, 3, 45, 1, 3]), axis=1)
+    means[:], dc[:], scales[:], quats[:] = still.means, still.sh[:, 0], still.log_scales, still.quats
+    opacities[:, 0] = still.opacity_logits
+    for channel in range(3):  # channel-major: all of red, then green, then blue
+        others[:, 15 * channel :][:, :rest] = still.sh[:, 1:, channel]
     _check_values(rows, _WRITTEN_NAMES, f"{path}: not written, because")
     properties = "".join(f"property float {name}\n" for name in _WRITTEN_NAMES)
-    comment = f"comment {_ANTIALIASED}\n" if antialiased else ""
+    comment = "comment SplatRenderMode: mip\n" if antialiased else ""
     # Some viewers expect the count on the third line.
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {n}\n{properties}{comment}{trailer}"
     with atomic_write(path) as file:

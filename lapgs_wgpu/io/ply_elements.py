@@ -165,12 +165,12 @@ def _place(
     end, line = start, 0
     placed: dict[str, Element] = {}
     for name, element in elements.items():
-        if element.has_lists and "vertex" in elements.keys() - placed.keys():
-            raise InputError(
-                f"{path}: element {name[:40]!r} has lists, which are read neither in vertex nor before it; "
-                "write the file again with another program."
-            )
         if element.has_lists:
+            if "vertex" in elements.keys() - placed.keys():
+                raise InputError(
+                    f"{path}: element {name[:40]!r} has lists, which are read neither in vertex nor before it; "
+                    "write the file again with another program."
+                )
             return placed
         placed[name] = element
         element.offset = line if text else end
