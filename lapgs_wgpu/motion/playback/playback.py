@@ -66,10 +66,8 @@ class DevicePlayback:
         pool = BufferPool(device)
         arrays = {name: pool.upload(name, activated[name]) for name in ("means", "quats", "scales", "opacities", "sh")}
         self._now = Gaussians(**arrays, antialiased=file.antialiased)
-        self._field: GridFieldPlayback | None = None
+        self._field = GridFieldPlayback(device, file.field_config, file.field, activated) if self.moves else None
         self._time: float | None = None  # of the Gaussians in the buffers, where a field moves them
-        if self.moves:
-            self._field = GridFieldPlayback(device, file.field_config, file.field, activated)
 
     def at(self, t: float) -> Gaussians[DeviceArray]:
         t = self._file.timing(t)
