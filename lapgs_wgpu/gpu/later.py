@@ -1,8 +1,10 @@
 """Small results that are read some time after they were submitted, without a wait for what was submitted since."""
 
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import wgpu
 from numpy.typing import NDArray
 
@@ -19,20 +21,18 @@ class Later:
     """
 
     def __init__(self, commands: Commands, arrays: Sequence[DeviceArray], ring: list[Any]) -> None:
-        self._device, self._arrays, self._nbytes = commands.device, arrays, sum(array.nbytes for array in arrays)
-        self._ring, large_enough = ring, [buffer for buffer in ring if buffer.size >= self._nbytes]
-        if large_enough:
-            self._buffer = large_enough[0]
+        self._device, self._arrays, self._ring = commands.device, arrays, ring
+        *self._starts, self._nbytes = itertools.accumulate((array.nbytes for array in arrays), initial=0)
+        self._buffer = next((buffer for buffer in ring if buffer.size >= self._nbytes), None)
+        if self._buffer is not None:
             ring.remove(self._buffer)
         else:
             with translated_errors(self._device, "what is read later", self._nbytes):
                 self._buffer = self._device.wgpu_device.create_buffer(
                     label="later", size=self._nbytes, usage=wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.COPY_DST
                 )
-        at = 0
-        for array in arrays:
-            commands.copy_out(array, self._buffer, at)
-            at += array.nbytes
+        for array, start in zip(arrays, self._starts, strict=True):
+            commands.copy_out(array, self._buffer, start)
         self._mapping: Mapping
 
     def submitted(self) -> None:
@@ -42,14 +42,10 @@ class Later:
 
     def read(self) -> list[NDArray[Any]]:
         """The arrays' contents. Raises DeviceError where the device does not give them."""
-        found, at = [], 0
         with translated_errors(self._device, "what is read later"):
             self._mapping.wait()
             check_not_lost(self._device)  # the native library would end the process
-            with self._mapping as content:
-                for array in self._arrays:
-                    values = content[at : at + array.nbytes].copy()
-                    found.append(values.view(array.dtype).reshape(array.shape))
-                    at += array.nbytes
+            with self._mapping as mapped:
+                parts = np.split(mapped.copy(), self._starts[1:])
         self._ring.append(self._buffer)
-        return found
+        return [part.view(array.dtype).reshape(array.shape) for part, array in zip(parts, self._arrays, strict=True)]

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.gpu.array import DeviceArray
-from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.array import Buffer, DeviceArray
 from lapgs_wgpu.gpu.device import Device
 
 _MOST_CONSTANTS = 1024  # of a pool: those of earlier sizes accumulate

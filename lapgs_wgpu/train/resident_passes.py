@@ -6,11 +6,10 @@ from typing import Any
 
 from lapgs_wgpu.data.views import View
 from lapgs_wgpu.gpu.array import DeviceArray
-from lapgs_wgpu.gpu.kernel import Commands, Kernel
+from lapgs_wgpu.gpu.kernel import Commands, Kernel, Recording
 from lapgs_wgpu.gpu.later import Later
 from lapgs_wgpu.gpu.matmul import sum_columns
 from lapgs_wgpu.gpu.pool import BufferPool
-from lapgs_wgpu.gpu.recording import Recording
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.passes.activation_passes import ActivationPasses, Line
 from lapgs_wgpu.motion.passes.decoder_passes import Decoding
@@ -79,7 +78,7 @@ class ResidentPasses:
         self._activation = ActivationPasses(scene.device, scene.field_config)
         self.rasterizer, self._losses = rasterizer_of(scene.device), image_loss_of(scene.device)
         self._pool = BufferPool(scene.device)
-        self._recordings: dict[tuple[Any, ...], tuple[Recording, Recorded]] = {}
+        self._recordings: dict[tuple[Any, ...], Recording[Recorded]] = {}
         level = BACKGROUND_LEVELS[config.data.background]
         self._background, self._checked = (level, level, level), False
         self._dynamics_loss = bool(config.loss.dynamics) and scene.field_config.dynamics_size > 0
@@ -125,19 +124,16 @@ class ResidentPasses:
             *(camera.width, camera.height, self.rasterizer.plan_of(camera), len(self._scene)),
             self.corrections.moves_camera,
         )
-        self._recordings = {key: each for key, each in self._recordings.items() if each[0].holds}
-        if shape in self._recordings:
-            recording, step = self._recordings[shape]
-            step[0].camera = camera
-            commands.replay(recording)
-            return step
         if self._device.textures:  # copies to them depend on what was done before
             return self._record(commands, task, held)
-        recording = Recording(self._device)
-        with commands.taken_down(recording):
-            step = self._record(commands, task, held)
-        self._recordings[shape] = recording, step
-        return step
+        self._recordings = {key: each for key, each in self._recordings.items() if each.holds}
+        if shape in self._recordings:
+            recording = self._recordings[shape]
+            recording.result[0].camera = camera
+            recording.replay(commands)
+        else:
+            recording = self._recordings[shape] = Recording(commands, lambda: self._record(commands, task, held))
+        return recording.result
 
     def at(self, t: float, degree: int) -> Gaussians[DeviceArray]:
         """The Gaussians at a time of the field, in arrays that the next step overwrites. degree: of the harmonics."""
