@@ -91,15 +91,13 @@ class ResidentCorrections:
         cameras = self._cameras
         if cameras is None:
             return frame
-        kernel = Kernel.get(self._device, "move_camera")
-
-        def write() -> bytes:
-            return kernel.uniform("Moved", row=cameras.numbers[self._view.camera], unit=cameras.extent)
-
-        moved = self._pool.array(f"frame {band}", frame.shape, frame.dtype)
-        given = {"moved": self._pool.varying("moved", write), "placed": frame, "cameras": self._camera_rows}
-        commands.dispatch(kernel, 1, **given, frame=moved)
-        return moved
+        kernel, unit = Kernel.get(self._device, "move_camera"), cameras.extent
+        moved = self._pool.varying(
+            "moved", lambda: kernel.uniform("Moved", row=cameras.numbers[self._view.camera], unit=unit)
+        )
+        corrected = self._pool.array(f"frame {band}", frame.shape, frame.dtype)
+        commands.dispatch(kernel, 1, moved=moved, placed=frame, cameras=self._camera_rows, frame=corrected)
+        return corrected
 
     def expose(self, commands: Commands, image: DeviceArray) -> DeviceArray:
         """Record the image with its colors corrected."""

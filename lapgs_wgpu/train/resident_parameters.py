@@ -47,11 +47,6 @@ class Block:
     moving: bool = True
     arrays: dict[str, DeviceArray] = field(default_factory=dict)
 
-    @property
-    def rate_columns(self) -> int:
-        """Number of columns with a rate of their own."""
-        return self.shape[1] if self.group is None else 1
-
     def gather(self, tensors: Mapping[str, Tensor | None]) -> NDArray[np.float32]:
         """The content for the device; tensors that are None are zeros."""
         out = np.zeros(self.shape, np.float32)
@@ -77,7 +72,7 @@ class ResidentParameters:
     def __init__(self, learners: Learners, weights: FieldWeights | None) -> None:
         scene = learners.scene
         self._device, self._pool, self._weights = scene.device, BufferPool(scene.device), weights
-        self._optimizer, self._frequencies = learners.optimizer, learners.frequencies
+        self._states, self._frequencies = learners.optimizer.states, learners.frequencies
         tensors = dict(scene.field.named_parameters()) if scene.field is not None else {}
         self._tensors: dict[str, Mapping[str, Tensor]] = {"gaussians": scene.parameters, "field": tensors}  # by part
         self._blocks_of: dict[str, list[Block]] = {}  # by part
@@ -86,12 +81,6 @@ class ResidentParameters:
         self.values_on_host, self.state_on_host = set(PARTS), set(PARTS)
 
     # The host's tensors and the device's arrays ----------------------------------------------------------------------
-
-    def _lay_out(self, part: str) -> None:
-        """Make arrays for the tensors of a part as they are."""
-        self._blocks_of[part] = self._gaussians_layout() if part == "gaussians" else self._field_layout()
-        for block in self._blocks_of[part]:
-            block.arrays = {kind: self._pool.array(f"{block.name} {kind}", block.shape) for kind in KINDS}
 
     def _write(self, part: str, kind: str, tensors: Mapping[str, Tensor | None]) -> None:
         """Upload all of a kind; tensors that are None are zeros."""
@@ -140,14 +129,16 @@ class ResidentParameters:
     def push_values(self) -> None:
         """Upload the values that the host may have changed."""
         for part in [part for part in PARTS if part in self.values_on_host]:
-            self._lay_out(part)
+            self._blocks_of[part] = self._gaussians_layout() if part == "gaussians" else self._field_layout()
+            for block in self._blocks_of[part]:
+                block.arrays = {kind: self._pool.array(f"{block.name} {kind}", block.shape) for kind in KINDS}
             self._write(part, "value", self._tensors[part])
 
     def push(self) -> None:
         """Upload what the host may have changed; from now on the device has the newest."""
         self.push_values()
         for part in [part for part in PARTS if part in self.state_on_host]:
-            state = {name: self._optimizer.state_of(tensor) for name, tensor in self._tensors[part].items()}
+            state = {name: self._states.get(tensor, {}) for name, tensor in self._tensors[part].items()}
             self.steps |= {name: int(each.get("step", 0)) for name, each in state.items()}
             for kind, key in (("mean", "exp_avg"), ("square", "exp_avg_sq")):
                 self._write(part, kind, {name: each.get(key) for name, each in state.items()})
@@ -172,7 +163,8 @@ class ResidentParameters:
             self._read(part, "square", squares)
             for name, tensor in tensors.items():
                 if self.steps[name] and name != FREQUENCIES:
-                    self._optimizer.set_state(tensor, self.steps[name], means[name], squares[name])
+                    steps = torch.tensor(float(self.steps[name]))
+                    self._states[tensor] = {"step": steps, "exp_avg": means[name], "exp_avg_sq": squares[name]}
             if part == "field" and self._frequencies is not None:
                 moments, own = self._frequency_state.read(), self._frequencies.state()
                 own["mean"].copy_(torch.from_numpy(moments[:-1]))
@@ -214,11 +206,10 @@ class ResidentParameters:
                 self.steps[name] += 1
 
     def _rates(self, block: Block, rates_of: Callable[[], Mapping[str, float]]) -> bytes:
-        """The corrected rates of a step, a pair for each column that has its own."""
-        table, rates = np.zeros((block.rate_columns, 2), np.float32), rates_of()
-        for name, (_, place) in block.parts.items():
+        """The corrected rates of a step, a pair for each column."""
+        table, rates = np.zeros((block.shape[1], 2), np.float32), rates_of()
+        for name, (_, columns) in block.parts.items():
             if name != FREQUENCIES:
-                columns = place if block.group is None else 0
                 table[columns] = _corrected(rates[block.group or name], self.steps[name])
         return table.tobytes()
 
@@ -229,9 +220,9 @@ class ResidentParameters:
         kernel = Kernel.get(self._device, "adam")
         for block in self._moved(moving=moving):
             written = self._pool.varying(f"rates {block.name}", partial(self._rates, block, rates_of))
-            rates = DeviceArray(written.buffer, (block.rate_columns, 2), offset=written.offset)
+            rates = DeviceArray(written.buffer, (block.shape[1], 2), offset=written.offset)
             count = block.arrays["value"].size if block.moved is None else block.moved
-            content = kernel.uniform("Adam", count=count, columns=block.rate_columns, first=0)
+            content = kernel.uniform("Adam", count=count, columns=block.shape[1], first=0)
             arrays = {name: block.arrays[name[:-1]] for name in ("gradients", "values", "means", "squares")}
             adam = self._pool.constant(content)
             commands.dispatch(kernel, -(-count // 256), adam=adam, guard=guard, rates=rates, **arrays)

@@ -6,8 +6,7 @@ from typing import Any
 
 from lapgs_wgpu.data.views import View
 from lapgs_wgpu.gpu.array import DeviceArray
-from lapgs_wgpu.gpu.kernel import Commands, Kernel, Recording
-from lapgs_wgpu.gpu.later import Later
+from lapgs_wgpu.gpu.kernel import Commands, Kernel, Later, Recording
 from lapgs_wgpu.gpu.matmul import sum_columns
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.grid_field import GridField

@@ -16,8 +16,7 @@ from torch import Tensor
 
 from lapgs_wgpu.errors import NumericalError
 from lapgs_wgpu.gpu.array import read_all
-from lapgs_wgpu.gpu.kernel import Commands
-from lapgs_wgpu.gpu.later import Later
+from lapgs_wgpu.gpu.kernel import Commands, Later
 from lapgs_wgpu.motion.passes.samples import Samples
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.train.density_control import DensityControl

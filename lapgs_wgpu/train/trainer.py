@@ -94,10 +94,6 @@ class Trainer:
         self.warm_up_steps, self._ramp_steps = start.warm_up_steps, start.ramp_steps
         self._threads = step_threads(self.config.field, device)
         self._generator = torch.Generator().manual_seed(config.seed)
-        self._prepare(start)
-        self.whole = True
-
-    def _prepare(self, start: Start) -> None:
         config, scene, dataset = self.config, self.scene, self.dataset
         color = torch.full((3,), BACKGROUND_LEVELS[config.data.background])
         self._truth = GroundTruth(scene.device, color, int(config.data.cache_gb * 1e9))
@@ -116,6 +112,7 @@ class Trainer:
         self._plans, camera = rasterizer_of(scene.device).plans, dataset.train[0].camera
         self._drawn = (camera.width, camera.height, True)  # the kind of images that the steps draw
         self._plans.set_bands(self._drawn, 1)
+        self.whole = True
 
     @property
     def cameras(self) -> CameraRefinement | None:
