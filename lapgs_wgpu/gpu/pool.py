@@ -45,8 +45,7 @@ class BufferPool:
         if content not in self._constants:
             if len(self._constants) >= _MOST_CONSTANTS:
                 self._constants.clear()
-            array = DeviceArray.upload(self.device, "constant", np.frombuffer(content, np.uint8))
-            self._constants[content] = array
+            self._constants[content] = DeviceArray.upload(self.device, "constant", np.frombuffer(content, np.uint8))
         return self._constants[content]
 
     def varying(self, name: str, write: Callable[[], bytes]) -> DeviceArray:

@@ -50,6 +50,8 @@ class Block:
     def gather(self, tensors: Mapping[str, Tensor | None]) -> NDArray[np.float32]:
         """The content for the device; tensors that are None are zeros."""
         out = np.zeros(self.shape, np.float32)
+        if self.ones:
+            out[:, -1] = 1.0
         for name, place in self.parts.items():
             tensor = tensors[name]
             if tensor is not None:
@@ -85,10 +87,7 @@ class ResidentParameters:
     def _write(self, part: str, kind: str, tensors: Mapping[str, Tensor | None]) -> None:
         """Upload all of a kind; tensors that are None are zeros."""
         for block in self._blocks_of[part]:
-            values = block.gather(tensors)
-            if block.ones and kind == "value":
-                values[:, -1] = 1.0
-            block.arrays[kind].write(values)
+            block.arrays[kind].write(block.gather(tensors))
 
     def _read(self, part: str, kind: str, into: Mapping[str, Tensor]) -> None:
         """Copy all of a kind into tensors."""

@@ -65,7 +65,8 @@ Decodings = tuple[Decoding | None, Line | None]
 class ResidentPasses:
     """Records the passes of the steps of a training.
 
-    parameters, corrections: what the steps move, the latter of cameras and colors.
+    parameters, corrections: what the steps move, the latter of cameras and colors. guard: the word that names the step
+    which may change nothing, nor those behind it; 0 where all is well.
     """
 
     def __init__(self, learners: Learners) -> None:
@@ -77,6 +78,8 @@ class ResidentPasses:
         self._activation = ActivationPasses(scene.device, scene.field_config)
         self.rasterizer, self._losses = rasterizer_of(scene.device), image_loss_of(scene.device)
         self._pool = BufferPool(scene.device)
+        self.guard, self._bad = (self._pool.array(name, (1,), "uint32") for name in ("guard", "bad"))
+        self._totals = self._pool.array("totals", (len(TOTALS),))
         self._recordings: dict[tuple[Any, ...], Recording[Recorded]] = {}
         level = BACKGROUND_LEVELS[config.data.background]
         self._background, self._checked = (level, level, level), False
@@ -105,10 +108,6 @@ class ResidentPasses:
     def seen(self) -> DeviceArray:
         """Density control's statistics, (N, 2)."""
         return self._pool.array("statistics", (len(self._scene), 2))
-
-    def word(self, name: str) -> DeviceArray:
-        """A word that passes share: guard or bad."""
-        return self._pool.array(name, (1,), "uint32")
 
     def record(self, commands: Commands, task: Task, truth: DeviceArray) -> Recorded:
         """Record a step. truth: (H, W), of its view."""
@@ -153,9 +152,7 @@ class ResidentPasses:
         self.rasterizer.backward(self.rasterizer.draw_whole(drawn, camera, gradient=True), d_image)
 
     def _record(self, commands: Commands, task: Task, truth: DeviceArray) -> Recorded:
-        guard, bad = self.word("guard"), self.word("bad")
-        totals = self._pool.array("totals", (len(TOTALS),))
-        for array in (bad, totals):
+        for array in (self._bad, self._totals):
             commands.clear(array)
         decodings = self._decode(commands, task)
         drawn = self._activate(commands, task.sh_degree, decodings[0])
@@ -166,9 +163,9 @@ class ResidentPasses:
         d_image = corrections.expose_bwd(commands, drawing.image, d_image)
         by_drawn = self.rasterizer.record_bwd(commands, drawing, d_image, camera=corrections.moves_camera)
         corrections.sum_camera(commands, by_drawn.camera)
-        self._record_bwd(commands, drawn, by_drawn, decodings, totals)
+        self._record_bwd(commands, drawn, by_drawn, *decodings)
         self._record_end(commands, task, drawing, by_drawn, terms)
-        return drawing, [guard, bad, terms, totals, *drawing.needed]
+        return drawing, [self.guard, self._bad, terms, self._totals, *drawing.needed]
 
     def _decode(self, commands: Commands, task: Task) -> Decodings:
         """Record the field; what varies from step to step is asked for anew."""
@@ -195,16 +192,15 @@ class ResidentPasses:
         commands: Commands,
         drawn: Gaussians[DeviceArray],
         by_drawn: GaussianGradients,
-        decodings: Decodings,
-        totals: DeviceArray,
+        decoding: Decoding | None,
+        line: Line | None,
     ) -> None:
         """Record the losses of motion, and the gradients of the parameters from those of what was drawn."""
         passes, field, smooth = self._activation, self._field, self._config.smoothness
-        decoding, line = decodings
         values, gradients = self.parameters.arrays("value"), self.parameters.arrays("gradient")
         if line is not None:
             accelerations = passes.acceleration(commands, line, values.geometry, drawn, by_drawn, gradients.geometry)
-            self._total(commands, accelerations, "acceleration", line.scale, totals)
+            self._total(commands, accelerations, "acceleration", line.scale)
         d_sh = self.parameters.blocks["sh"].arrays["gradient"]
         passes.activate_bwd(commands, values.geometry, drawn, by_drawn, decoding, gradients.geometry, d_sh)
         if field is None or decoding is None:
@@ -216,15 +212,15 @@ class ResidentPasses:
             near, times = self._of_task("near"), (decoding.time, self._of_task("near_time"))
             differences = field.compare(commands, values, gradients, near, times, weights)
             for total, sums, weight in zip(TOTALS, differences, weights, strict=False):
-                self._total(commands, sums, total, weight, totals)
+                self._total(commands, sums, total, weight)
         if self._dynamics_loss:
-            self._dynamics(commands, values.beside, gradients.beside, totals)
+            self._dynamics(commands, values.beside, gradients.beside)
 
-    def _total(self, commands: Commands, values: DeviceArray, name: str, factor: float, totals: DeviceArray) -> None:
+    def _total(self, commands: Commands, values: DeviceArray, name: str, factor: float) -> None:
         """Record the sum of values, times a factor, in the place of this name."""
-        sum_columns(commands, self._pool, values, totals, place=TOTALS.index(name), factor=factor)
+        sum_columns(commands, self._pool, values, self._totals, place=TOTALS.index(name), factor=factor)
 
-    def _dynamics(self, commands: Commands, rows: DeviceArray, d_rows: DeviceArray, totals: DeviceArray) -> None:
+    def _dynamics(self, commands: Commands, rows: DeviceArray, d_rows: DeviceArray) -> None:
         """Record the loss of the dynamics attributes and its gradient (motion/fields/dynamics)."""
         n, stride = rows.shape
         sums = ("distance_sums", "square_sums", "losses")
@@ -236,23 +232,23 @@ class ResidentPasses:
             kernel = Kernel.get(self._device, name, GROUPS=_DYNAMICS_GROUPS)
             arrays["dynamics"] = self._pool.constant(kernel.uniform("Dynamics", **sizes))
             commands.run(kernel, _DYNAMICS_GROUPS, arrays)
-        self._total(commands, arrays["losses"], "dynamics", 1.0, totals)
+        self._total(commands, arrays["losses"], "dynamics", 1.0)
 
     def _record_end(
         self, commands: Commands, task: Task, drawing: Drawing, by_drawn: GaussianGradients, terms: DeviceArray
     ) -> None:
         """Record whether the step may change anything, and what it changes."""
-        moving, count, guard, bad = task.scheduled.moving, len(self._scene), self.word("guard"), self.word("bad")
-        self.parameters.record_check(commands, bad, moving=moving)
-        self.corrections.record_check(commands, bad)
-        check_finite(commands, self._pool, terms, bad)
+        moving, count, guard = task.scheduled.moving, len(self._scene), self.guard
+        self.parameters.record_check(commands, self._bad, moving=moving)
+        self.corrections.record_check(commands, self._bad)
+        check_finite(commands, self._pool, terms, self._bad)
         close = Kernel.get(self._device, "close_guard")
         given = {"capacity": drawing.plan.capacity, "rounds": int(bool(self.rasterizer.config.round_splats))}
         guarded = self._pool.varying(
             "guarded", lambda: close.uniform("Guarded", step=self._task.scheduled.step, **given)
         )
         for needed in drawing.needed:
-            commands.dispatch(close, 1, guarded=guarded, needed=needed, bad=bad, guard=guard)
+            commands.dispatch(close, 1, guarded=guarded, needed=needed, bad=self._bad, guard=guard)
         if task.scheduled.seen:
             kernel, camera = Kernel.get(self._device, "accumulate_statistics"), task.view.camera
             content = kernel.uniform("Seen", half_size=(camera.width / 2, camera.height / 2), gaussians=count)

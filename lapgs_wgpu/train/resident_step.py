@@ -135,8 +135,8 @@ class ResidentStep:
         self._passes.corrections.push()
         if self._statistics_on_host:
             self._statistics_on_host = False
-            columns = [values.numpy(force=True) for values in vars(self._density.statistics).values()]
-            self._passes.seen().write(np.stack(columns, axis=1).astype(np.float32))
+            seen = torch.stack([*vars(self._density.statistics).values()], dim=1)
+            self._passes.seen().write(seen.numpy(force=True))
         truth = self._draws.truth.on_device(task.view)
         self._passes.check_driver(task)
         task.counts = dict(self.parameters.steps)
@@ -165,7 +165,7 @@ class ResidentStep:
             raise
 
     def _settle(self) -> None:
-        first, word = self._flying[0], self._passes.word
+        first = self._flying[0]
         guard, bad, values, totals, *needed = first.later.read()
         terms = self._passes.terms(first, values.tolist(), totals.tolist())
         told = Measured(sum(terms.values()), psnr_of(float(values[1])), terms=terms)
@@ -178,7 +178,7 @@ class ResidentStep:
         self._flying.clear()
         for each in behind[1:]:
             each.later.read()
-        word("guard").write(np.zeros(1, np.uint32))
+        self._passes.guard.write(np.zeros(1, np.uint32))
         self.parameters.steps = dict(first.counts)
         if bad[0] & _OVERFLOW:
             self._passes.rasterizer.grow_on_overflow(first.drawing, needed)
