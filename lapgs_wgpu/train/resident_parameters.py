@@ -4,7 +4,7 @@ Between two looks of the host the device has the newest values. Whoever reads to
 next step pushes what the host may have changed.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -198,27 +198,26 @@ class ResidentParameters:
         for block in self._moved(moving=moving):
             check_finite(commands, self._pool, block.arrays["gradient"], bad)
 
-    def count_step(self, *, moving: bool) -> None:
-        """A step that moves the parameters is about to be recorded."""
+    def begin(self, rates: Mapping[str, float], *, moving: bool) -> None:
+        """Say what is recorded or replayed next: a step at these rates of the optimizer's groups and of FREQUENCIES."""
+        self._rates = rates
         for block in self._moved(moving=moving):
             for name in block.parts:
                 self.steps[name] += 1
 
-    def _rates(self, block: Block, rates_of: Callable[[], Mapping[str, float]]) -> bytes:
+    def _rates_of(self, block: Block) -> bytes:
         """The corrected rates of a step, a pair for each column."""
-        table, rates = np.zeros((block.shape[1], 2), np.float32), rates_of()
+        table = np.zeros((block.shape[1], 2), np.float32)
         for name, (_, columns) in block.parts.items():
             if name != FREQUENCIES:
-                table[columns] = _corrected(rates[block.group or name], self.steps[name])
+                table[columns] = _corrected(self._rates[block.group or name], self.steps[name])
         return table.tobytes()
 
-    def record_adam(
-        self, commands: Commands, guard: DeviceArray, rates_of: Callable[[], Mapping[str, float]], *, moving: bool
-    ) -> None:
-        """Record a step of the optimizers, by the rates of its groups and of FREQUENCIES."""
+    def record_adam(self, commands: Commands, guard: DeviceArray, *, moving: bool) -> None:
+        """Record a step of the optimizers."""
         kernel = Kernel.get(self._device, "adam")
         for block in self._moved(moving=moving):
-            written = self._pool.varying(f"rates {block.name}", partial(self._rates, block, rates_of))
+            written = self._pool.varying(f"rates {block.name}", partial(self._rates_of, block))
             rates = DeviceArray(written.buffer, (block.shape[1], 2), offset=written.offset)
             count = block.arrays["value"].size if block.moved is None else block.moved
             content = kernel.uniform("Adam", count=count, columns=block.shape[1], first=0)
@@ -226,21 +225,18 @@ class ResidentParameters:
             adam = self._pool.constant(content)
             commands.dispatch(kernel, -(-count // 256), adam=adam, guard=guard, rates=rates, **arrays)
         if moving and self._frequencies is not None:
-            self._record_frequencies(commands, guard, rates_of)
+            self._record_frequencies(commands, guard, self._frequencies.limit)
 
-    def _record_frequencies(
-        self, commands: Commands, guard: DeviceArray, rates_of: Callable[[], Mapping[str, float]]
-    ) -> None:
+    def _record_frequencies(self, commands: Commands, guard: DeviceArray, limit: float) -> None:
         assert self._weights is not None
-        assert self._frequencies is not None
         kernel, config = Kernel.get(self._device, "adam_frequencies"), self._weights.config
         given = {name: self._weights.places[f"motion.{name}"].first for name in ("alpha", "beta", "frequencies")}
         given |= {"width": config.width, "components": config.components}
-        bounds = {"limit": self._frequencies.limit, "largest": LARGEST_FREQUENCY_STEP}
+        bounds = {"limit": limit, "largest": LARGEST_FREQUENCY_STEP}
         bounds |= {"floor": VARIANCE_FLOOR, "spread": VARIANCE_SPREAD}
 
         def write() -> bytes:
-            corrected, factor = _corrected(rates_of()[FREQUENCIES], self.steps[FREQUENCIES])
+            corrected, factor = _corrected(self._rates[FREQUENCIES], self.steps[FREQUENCIES])
             return kernel.uniform("Frequencies", rate=corrected, square_factor=factor, **given, **bounds)
 
         spectrum = self._pool.varying("frequencies uniform", write)

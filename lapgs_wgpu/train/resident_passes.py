@@ -113,7 +113,7 @@ class ResidentPasses:
         """Record a step. truth: (H, W), of its view."""
         self._task = task
         self.corrections.begin(task.view, task.scheduled.step)
-        self.parameters.count_step(moving=task.scheduled.moving)
+        self.parameters.begin(task.rates, moving=task.scheduled.moving)
         held = self._losses.held(truth)
         commands.copy(truth, held)
         camera = task.view.camera
@@ -255,6 +255,6 @@ class ResidentPasses:
             arrays = {"splats": drawing.splats, "d_splats": by_drawn.splats, "statistics": self.seen()}
             seen = self._pool.constant(content)
             commands.dispatch(kernel, -(-count // 64), seen=seen, guard=guard, **arrays)
-        self.parameters.record_adam(commands, guard, lambda: self._task.rates, moving=moving)
+        self.parameters.record_adam(commands, guard, moving=moving)
         geometry = self.parameters.blocks["geometry"].arrays["value"]
         self.corrections.record_step(commands, guard, drawing.frames[0], geometry)
