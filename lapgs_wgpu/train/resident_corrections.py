@@ -1,5 +1,6 @@
 """The corrections of cameras and colors in device arrays, and the passes of a resident step that use and move them."""
 
+import numpy as np
 import torch
 
 from lapgs_wgpu.data.views import View
@@ -11,24 +12,23 @@ from lapgs_wgpu.train.camera_refinement import MOST_POINTS, CameraRefinement
 from lapgs_wgpu.train.exposure import Exposures
 from lapgs_wgpu.train.fused_loss import exposure_of
 from lapgs_wgpu.train.learners import Learners
-from lapgs_wgpu.train.resident_parameters import Block, check_finite
+from lapgs_wgpu.train.resident_parameters import Block, Place, check_finite
 
 _CAMERA_FLOATS, _EXPOSURE_FLOATS = 16, 40  # rows of camera_step.wgsl and exposure_step.wgsl
 _MOTION_FLOATS, _MOST_COMMON = 22, 8  # image_motion.wgsl, camera_step.wgsl
-_EVERY, _CAMERAS, _ALL = slice(None), slice(-1), slice(-1, None)
-_PLACES = {
+_PLACES: dict[str, dict[str, Place]] = {
     "cameras": {
-        "learnt": (_CAMERAS, slice(0, 6)),
-        "mean": (_CAMERAS, slice(6, 12)),
-        "steps": (_CAMERAS, slice(12, 13)),
-        "square": (_ALL, slice(0, 1)),
-        "moves": (_ALL, slice(1, 2)),
+        "learnt": np.s_[:-1, :6],
+        "mean": np.s_[:-1, 6:12],
+        "steps": np.s_[:-1, 12:13],
+        "square": np.s_[-1:, 0:1],
+        "moves": np.s_[-1:, 1:2],
     },
     "exposure": {
-        "values": (_EVERY, slice(0, 12)),
-        "mean": (_EVERY, slice(12, 24)),
-        "square": (_EVERY, slice(24, 36)),
-        "steps": (_EVERY, slice(36, 37)),
+        "values": np.s_[:, :12],
+        "mean": np.s_[:, 12:24],
+        "square": np.s_[:, 24:36],
+        "steps": np.s_[:, 36:37],
     },
 }
 

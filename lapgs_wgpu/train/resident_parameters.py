@@ -96,32 +96,32 @@ class ResidentParameters:
             block.scatter(content, into)
 
     def _gaussians_layout(self) -> list[Block]:
-        gaussians, every = self._tensors["gaussians"], slice(None)
+        gaussians = self._tensors["gaussians"]
         n = len(gaussians["means"])
-        columns = {"means": (0, 3), "opacity_logits": (3, 4), "quats": (4, 8), "log_scales": (8, 11)}
-        geometry = {name: (every, slice(*place)) for name, place in columns.items()}
-        colors = {"sh_dc": (every, slice(0, 3)), "sh_rest": (every, slice(3, SH_FLOATS))}
+        geometry = {"means": np.s_[:, :3], "opacity_logits": np.s_[:, 3:4]}
+        geometry |= {"quats": np.s_[:, 4:8], "log_scales": np.s_[:, 8:11]}
+        colors = {"sh_dc": np.s_[:, :3], "sh_rest": np.s_[:, 3:]}
         blocks = [
             Block("geometry", (n, GEOMETRY_FLOATS), None, geometry, moving=False),
             Block("sh", (n, SH_FLOATS), None, colors, moving=False),
         ]
         if self._weights is not None:
             size = self._weights.dynamics
-            dynamics = {"dynamics": (every, slice(0, size))} if "dynamics" in gaussians else {}
+            dynamics = {"dynamics": np.s_[:, :size]} if "dynamics" in gaussians else {}
             blocks.append(Block("beside", (n, size + 1), None, dynamics, ones=True))
         return blocks
 
     def _field_layout(self) -> list[Block]:
         if self._weights is None:
             return []
-        tensors, every = self._tensors["field"], slice(None)
+        tensors = self._tensors["field"]
         blocks = [
-            Block(name, (table.shape[0], 2), "hash", {name: (every, every)})
+            Block(name, (table.shape[0], 2), "hash", {name: np.s_[:, :]})
             for name, table in tensors.items()
             if name.endswith(".table")
         ]
         places, shape = self._weights.places, (self._weights.count, 1)
-        rows = {name: (slice(p.first, p.first + tensors[name].numel()), every) for name, p in places.items()}
+        rows = {name: np.s_[p.first : p.first + tensors[name].numel(), :] for name, p in places.items()}
         moved = places[FREQUENCIES].first if FREQUENCIES in rows else None
         return [*blocks, Block("weights", shape, "mlp", rows, moved=moved)]
 
