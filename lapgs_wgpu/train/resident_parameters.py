@@ -127,7 +127,7 @@ class ResidentParameters:
 
     def push_values(self) -> None:
         """Upload the values that the host may have changed."""
-        for part in [part for part in PARTS if part in self.values_on_host]:
+        for part in self.values_on_host:
             self._blocks_of[part] = self._gaussians_layout() if part == "gaussians" else self._field_layout()
             for block in self._blocks_of[part]:
                 block.arrays = {kind: self._pool.array(f"{block.name} {kind}", block.shape) for kind in KINDS}
@@ -136,7 +136,7 @@ class ResidentParameters:
     def push(self) -> None:
         """Upload what the host may have changed; from now on the device has the newest."""
         self.push_values()
-        for part in [part for part in PARTS if part in self.state_on_host]:
+        for part in self.state_on_host:
             state = {name: self._states.get(tensor, {}) for name, tensor in self._tensors[part].items()}
             self.steps |= {name: int(each.get("step", 0)) for name, each in state.items()}
             for kind, key in (("mean", "exp_avg"), ("square", "exp_avg_sq")):

@@ -83,7 +83,7 @@ class ResidentStep:
         self.parameters.push_values()
         now = self._passes.at(t, self._scene.sh_degree)
         tensors = [torch.from_numpy(array) for array in read_all(list(now.arrays().values()))]
-        return Gaussians(**dict(zip(now.arrays(), tensors, strict=True)), antialiased=now.antialiased)
+        return Gaussians(*tensors, antialiased=now.antialiased)
 
     def settle(self) -> None:
         """Wait for all steps."""
