@@ -152,10 +152,9 @@ class ResidentParameters:
     def pull(self, *parts: str, state: bool) -> None:
         """Make torch's tensors of some parts, of all if none is named, the newest ones. state: and the optimizers'."""
         for part in set(parts or PARTS) - self.values_on_host:
-            self.values_on_host.add(part)
             self._read(part, "value", self._tensors[part])
+            self.values_on_host.add(part)
         for part in set(parts or PARTS) - self.state_on_host if state else ():
-            self.state_on_host.add(part)
             tensors = self._tensors[part]
             means, squares = ({name: torch.zeros_like(tensor) for name, tensor in tensors.items()} for _ in range(2))
             self._read(part, "mean", means)
@@ -169,6 +168,7 @@ class ResidentParameters:
                 own["mean"].copy_(torch.from_numpy(moments[:-1]))
                 own["square"].fill_(float(moments[-1]))
                 own["steps"].fill_(self.steps[FREQUENCIES])
+            self.state_on_host.add(part)
 
     @property
     def blocks(self) -> dict[str, Block]:
