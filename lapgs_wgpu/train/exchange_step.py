@@ -50,7 +50,6 @@ class ExchangeStep:
         else:
             check_parameters(parameters)  # whose values a step cannot mend
             measured = measured._replace(skipped=Skipped(step, view.name, cause(measured.terms, gradients)))
-            self._learners.zero_grad()
         return lambda: measured
 
     def _compared(self, scheduled: Scheduled, t: float) -> tuple[Nearby | None, TimeSamples | None]:

@@ -58,8 +58,6 @@ class Task:
 
 # The passes of a step: its drawing, and what is read of it later.
 Recorded = tuple[Drawing, list[DeviceArray]]
-# The field at the time of a step, and for the loss of acceleration; None where a step is without.
-Decodings = tuple[Decoding | None, Line | None]
 
 
 class ResidentPasses:
@@ -154,8 +152,8 @@ class ResidentPasses:
     def _record(self, commands: Commands, task: Task, truth: DeviceArray) -> Recorded:
         for array in (self._bad, self._totals):
             commands.clear(array)
-        decodings = self._decode(commands, task)
-        drawn = self._activate(commands, task.sh_degree, decodings[0])
+        decoding, line = self._decode(commands, task)
+        drawn = self._activate(commands, task.sh_degree, decoding)
         corrections, weights = self.corrections, self._weights(task)
         drawing = self.rasterizer.record(commands, drawn, task.view.camera, self._background, corrections.move)
         image = corrections.expose(commands, drawing.image)
@@ -163,12 +161,12 @@ class ResidentPasses:
         d_image = corrections.expose_bwd(commands, drawing.image, d_image)
         by_drawn = self.rasterizer.record_bwd(commands, drawing, d_image, camera=corrections.moves_camera)
         corrections.sum_camera(commands, by_drawn.camera)
-        self._record_bwd(commands, drawn, by_drawn, *decodings)
+        self._record_bwd(commands, drawn, by_drawn, decoding, line)
         self._record_end(commands, task, drawing, by_drawn, terms)
         return drawing, [self.guard, self._bad, terms, self._totals, *drawing.needed]
 
-    def _decode(self, commands: Commands, task: Task) -> Decodings:
-        """Record the field; what varies from step to step is asked for anew."""
+    def _decode(self, commands: Commands, task: Task) -> tuple[Decoding | None, Line | None]:
+        """Record the field at a step's time and around it, where the step has these; what varies is asked for anew."""
         field, values = self._field, self.parameters.arrays("value")
         if field is None or not task.scheduled.moving:
             return None, None
