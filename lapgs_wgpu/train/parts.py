@@ -58,12 +58,6 @@ class TorchLoss(LossTerm):
     """
 
 
-# Names of the terms of the configuration, and of what stands beside them in the log.
-TAKEN_NAMES = frozenset(
-    {"l1", "mse", "ssim", "pyramid", "ncc", "smoothness", "acceleration", "dynamics", "loss", "psnr"}
-)
-
-
 @dataclass(frozen=True)
 class Parts:
     """Parts of a training that are Python objects.
@@ -86,7 +80,8 @@ class Parts:
     callbacks: Sequence[Callback] = ()
 
     def __post_init__(self) -> None:
-        taken = set(TAKEN_NAMES)
+        # By the terms of the configuration, and by what stands beside them in the log.
+        taken = {"l1", "mse", "ssim", "pyramid", "ncc", "smoothness", "acceleration", "dynamics", "loss", "psnr"}
         for term in self.losses:
             if not isinstance(term, LossTerm):
                 raise InputError(f"Parts(losses=...) must list Regularizer and TorchLoss, got a {type(term).__name__}.")

@@ -242,10 +242,8 @@ class Trainer:
     @torch.no_grad()
     def _picture(self, view: View, timing: Timing) -> Tensor:
         """The scene's picture (H, W, 3) of a training view, with the corrections of its camera and of its colors."""
-        image = self.scene.render(
-            self._learners.camera(view), view.time, self._truth.color, depth=False, timing=timing
-        ).image
-        correction = self.exposure_of(view)
+        camera, correction = self._learners.camera(view), self.exposure_of(view)
+        image = self.scene.render(camera, view.time, self._truth.color, depth=False, timing=timing).image
         return image if correction is None else image @ correction[:, :3].T + correction[:, 3]
 
     # The state between two steps -------------------------------------------------------------------------------------
