@@ -149,10 +149,8 @@ class DeviceArray:
 
     def rows(self, first: int, count: int) -> "DeviceArray":
         """Rows first to first + count; to be bound, they must begin at a multiple of 256 bytes."""
-        row = math.prod(self.shape[1:])
-        return DeviceArray(
-            self.buffer, (count, *self.shape[1:]), self.dtype, self.offset + first * row * _ITEM_BYTES[self.dtype]
-        )
+        row_bytes = math.prod(self.shape[1:]) * _ITEM_BYTES[self.dtype]
+        return DeviceArray(self.buffer, (count, *self.shape[1:]), self.dtype, self.offset + first * row_bytes)
 
     def write(self, values: NDArray[Any]) -> None:
         """Copy values of the array's dtype and shape to the device. Raises ValueError for others."""
