@@ -92,7 +92,6 @@ class Trainer:
         self.done = 0
         self.scene, self.discovery, self.discovery_seconds = start.scene, start.summary, start.seconds
         self.warm_up_steps, self._ramp_steps = start.warm_up_steps, start.ramp_steps
-        self._threads = step_threads(self.config.field, device)
         self._generator = torch.Generator().manual_seed(config.seed)
         config, scene, dataset = self.config, self.scene, self.dataset
         color = torch.full((3,), BACKGROUND_LEVELS[config.data.background])
@@ -183,7 +182,7 @@ class Trainer:
         control's state stay as they were; what the schedule plans for this step is done. Raises NumericalError where
         too many are skipped, or where a parameter is not finite, and DeviceError.
         """
-        with torch_threads(self._threads):
+        with torch_threads(step_threads(self.config.field, self.scene.device)):
             result = self._step()
         for callback in self.callbacks:
             callback(self, result)
