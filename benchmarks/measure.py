@@ -11,7 +11,7 @@ from unittest import mock
 import numpy as np
 
 from lapgs_wgpu.gpu import array, native
-from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.array import Buffer
 from lapgs_wgpu.gpu.kernel import Commands
 
 

@@ -15,7 +15,7 @@ from timestamps import Profile
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.gpu import array as array_module
-from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.array import Buffer
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields import hash_encoder
 from lapgs_wgpu.run import train

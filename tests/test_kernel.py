@@ -10,8 +10,7 @@ import wgpu
 from numpy.typing import NDArray
 
 from lapgs_wgpu.gpu import shader
-from lapgs_wgpu.gpu.array import DeviceArray, read_all
-from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.array import Buffer, DeviceArray, read_all
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.pool import BufferPool

@@ -131,13 +131,13 @@ def test_a_bad_parameter_stops_the_training_and_leaves_the_older_state(
         return original(gaussians, *rest)
 
     trainings: list[Trainer] = []
-    prepare = Trainer._prepare
+    prepare = Trainer.__init__
 
-    def note(self: Trainer, *given: Any) -> None:
+    def note(self: Trainer, *given: Any, **more: Any) -> None:
         trainings.append(self)
-        prepare(self, *given)
+        prepare(self, *given, **more)
 
-    monkeypatch.setattr(Trainer, "_prepare", note)
+    monkeypatch.setattr(Trainer, "__init__", note)
     monkeypatch.setattr(exchange_step, "render_loss", render)
     out = tmp_path / "run"
     with pytest.raises(NumericalError, match=r"^the parameters means are not finite, or too large; .* saved last"):

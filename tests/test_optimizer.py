@@ -25,7 +25,7 @@ def run(
 ) -> None:
     """Steps down a bowl whose shape differs from row to row; rows: the rows' numbers."""
     for step in steps:
-        optimizer.zero_grad()
+        optimizer._adam.zero_grad()
         stretch = 1.0 + rows
         loss = (gaussians["means"].square().sum(1) * stretch).sum() + (gaussians["weights"] * stretch).square().sum()
         (loss + mlp.square().sum()).backward()

@@ -1,18 +1,104 @@
-"""Arrays on the device: a part of a buffer with a dtype and a shape."""
+"""Buffers on the device, arrays in them, and the textures that tables are read through."""
 
+import functools
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+import wgpu
 from numpy.typing import NDArray
 
-from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.errors import DeviceMemoryError
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.gpu.native import Mapping
-from lapgs_wgpu.gpu.wgpu_errors import translated_errors
+from lapgs_wgpu.gpu.native import Mapping, TextureCopies, translated_errors
+from lapgs_wgpu.gpu.shader import TABLE_TYPES, TABLE_WIDTH
 
 _ITEM_BYTES = {"float32": 4, "uint32": 4, "uint8": 1, "uint64": 8}
+_STORAGE = wgpu.BufferUsage.STORAGE | wgpu.BufferUsage.UNIFORM | wgpu.BufferUsage.COPY_SRC | wgpu.BufferUsage.COPY_DST
+_MOST_ROWS = 8192  # of a texture, by WebGPU's default limits
+_numbers = itertools.count()
+
+
+@dataclass
+class _Texture:
+    texture: Any
+    view: Any
+    rows: int
+    place: tuple[int, int] | None = None  # offset and size of what is copied
+    copies: TextureCopies | None = None
+    version: int = -1  # of what was copied
+
+
+class Buffer:
+    """A storage or uniform buffer of `nbytes` (rounded up to 16), initially zero.
+
+    It is written through the queue, and read through a staging buffer of the same size, which is kept.
+    """
+
+    def __init__(self, device: Device, nbytes: int, label: str) -> None:
+        self.device = device
+        self.label = label
+        self.nbytes = max(16, (nbytes + 15) & ~15)
+        if self.nbytes > device.limits["max-buffer-size"]:
+            limit = device.limits["max-buffer-size"]
+            raise DeviceMemoryError(f"buffer {label!r} needs {self.nbytes} bytes, and one of this device holds {limit}")
+        self.wgpu_buffer = self._create(_STORAGE)
+        self.number = next(_numbers)  # unique, also among freed buffers
+        self.version = 0  # number of writes: tells whether a texture made from the buffer is out of date
+        self._textures: dict[str, _Texture] = {}
+
+    @functools.cached_property
+    def download(self) -> Any:
+        """The staging buffer for reading."""
+        return self._create(wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.COPY_DST)
+
+    def _create(self, usage: int) -> Any:
+        with translated_errors(self.device, f"buffer {self.label!r}", self.nbytes):
+            return self.device.wgpu_device.create_buffer(label=self.label, size=self.nbytes, usage=usage)
+
+    def write(self, array: NDArray[Any], offset: int = 0) -> None:
+        """Copy an array into the buffer, `offset` bytes (a multiple of 8) from its start."""
+        data = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
+        if offset + data.nbytes > self.nbytes:
+            raise ValueError(f"{self.label}: {offset + data.nbytes} bytes do not fit into {self.nbytes}")
+        if data.nbytes == 0:
+            return
+        self.version += 1
+        with translated_errors(self.device, f"what is written to buffer {self.label!r}", data.nbytes):
+            self.device.queue.write_buffer(self.wgpu_buffer, offset, data)
+
+    def texture(self, texel_format: str, offset: int, size: int) -> tuple[Any, TextureCopies | None]:
+        """Return a view of a texture that holds `size` bytes from `offset` on, in rows of TABLE_WIDTH texels.
+
+        If the buffer has changed, also the copies that have to be made first.
+        """
+        texel = next(nbytes for name, nbytes, _ in TABLE_TYPES.values() if name == texel_format)
+        count = size // texel
+        rows = -(-count // TABLE_WIDTH)
+        held = self._textures.get(texel_format)
+        if held is None or held.rows < rows:
+            # Mesa's software driver compiles a shader anew for each combination of textures whose heights are and are
+            # not powers of two.
+            if rows.bit_count() == 1 and rows < _MOST_ROWS:
+                rows = max(3, rows + 1)
+            with translated_errors(self.device, f"the texture of buffer {self.label!r}", rows * TABLE_WIDTH * texel):
+                texture = self.device.wgpu_device.create_texture(
+                    label=self.label,
+                    size=(TABLE_WIDTH, rows, 1),
+                    format=texel_format,
+                    usage=wgpu.TextureUsage.STORAGE_BINDING | wgpu.TextureUsage.COPY_DST,
+                )
+            held = self._textures[texel_format] = _Texture(texture, texture.create_view(), rows)
+        if held.place != (offset, size):
+            held.place, held.version = (offset, size), -1
+            held.copies = TextureCopies(self.wgpu_buffer, offset, held.texture, TABLE_WIDTH, texel, count)
+        if held.version == self.version:
+            return held.view, None
+        held.version = self.version
+        return held.view, held.copies
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,10 +149,8 @@ class DeviceArray:
 
     def rows(self, first: int, count: int) -> "DeviceArray":
         """Rows first to first + count; to be bound, they must begin at a multiple of 256 bytes."""
-        row = math.prod(self.shape[1:])
-        return DeviceArray(
-            self.buffer, (count, *self.shape[1:]), self.dtype, self.offset + first * row * _ITEM_BYTES[self.dtype]
-        )
+        row_bytes = math.prod(self.shape[1:]) * _ITEM_BYTES[self.dtype]
+        return DeviceArray(self.buffer, (count, *self.shape[1:]), self.dtype, self.offset + first * row_bytes)
 
     def write(self, values: NDArray[Any]) -> None:
         """Copy values of the array's dtype and shape to the device. Raises ValueError for others."""

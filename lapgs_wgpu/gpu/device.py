@@ -123,7 +123,7 @@ class Device:
     wgpu_device, queue: wgpu's objects.
     textures: whether tables are read through textures (gpu/shader), which is much faster on Mesa's software driver.
     watchdog: whether the driver ends a submission that takes seconds, as on Windows and macOS (all but CPU devices).
-    recording: the Recording in which is taken down what is done now; None where it is not.
+    recording: the Recording that is made now; None where none is.
     generation: number of buffers that pools have made: what was recorded before the last one may use a freed one.
     """
 

@@ -1,20 +1,25 @@
-"""Compute kernels, whose arrays are bound by name, and lists of commands that run them."""
+"""Compute kernels, whose arrays are bound by name; commands that run them, their recordings and their results."""
 
+import itertools
 import re
 import weakref
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Generic, TypeVar
 
+import numpy as np
 import wgpu
+from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import DeviceMemoryError
 from lapgs_wgpu.gpu import native
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.gpu.recording import Recording
+from lapgs_wgpu.gpu.native import check_not_lost, translated_errors
 from lapgs_wgpu.gpu.shader import Defines, ShaderError, compose, enabled, pack, reflect
-from lapgs_wgpu.gpu.wgpu_errors import translated_errors
+
+_APART = 256  # bytes: bindings of uniforms may begin at its multiples
+_ROOM = 128 * _APART  # of a recording's uniforms
+T = TypeVar("T")
 
 
 class Kernel:
@@ -142,21 +147,6 @@ class Commands:
         """Copy an array to a wgpu buffer, `offset` bytes from its start."""
         self._list.append(("copy", source.buffer.wgpu_buffer, source.offset, target, offset, source.nbytes))
 
-    @contextmanager
-    def taken_down(self, recording: Recording) -> Iterator[None]:
-        """Take down in a recording what is done within, for `replay`."""
-        first, self.device.recording = len(self._list), recording
-        try:
-            yield
-        finally:
-            self.device.recording = None
-        recording.finish(self._list[first:])
-
-    def replay(self, recording: Recording) -> None:
-        """Do what was recorded, with uniforms that are written anew."""
-        recording.renew()
-        self._list += recording.commands
-
     def flush(self) -> None:
         """Submit what was recorded so far, where a watchdog ends long submissions, and go on. It runs even where the
         `with` block fails later."""
@@ -183,3 +173,86 @@ class Commands:
                 values[1].version += 1
         with translated_errors(self.device, "commands"):
             raise error
+
+
+class Recording(Generic[T]):
+    """What a function recorded in `Commands`, to be submitted again: a dispatch then takes its host a few microseconds.
+
+    result: what the function returned.
+    """
+
+    def __init__(self, commands: Commands, record: Callable[[], T]) -> None:
+        device = self._device = commands.device
+        self._uniforms, self._used = DeviceArray.empty(device, "uniforms", (_ROOM,), "uint8"), 0
+        self._varying: dict[object, tuple[DeviceArray, Callable[[], bytes]]] = {}
+        first, device.recording = len(commands._list), self
+        try:
+            self.result = record()
+        finally:
+            device.recording = None
+        self._commands, self._generation = commands._list[first:], device.generation
+        self._renew()
+
+    @property
+    def holds(self) -> bool:
+        """Whether it may be done again: no array that it uses was made anew."""
+        return self._generation == self._device.generation
+
+    def replay(self, commands: Commands) -> None:
+        """Record it again, with uniforms that are written anew."""
+        self._renew()
+        commands._list += self._commands
+
+    def varying(self, key: object, write: Callable[[], bytes]) -> DeviceArray:
+        """A uniform that `write` gives anew before each replay; the one that it was where the key is known."""
+        if key not in self._varying:
+            place = self._uniforms.rows(self._used, len(write()))
+            self._used += -(-place.nbytes // _APART) * _APART
+            if self._used > _ROOM:
+                raise ValueError(f"the varying uniforms of a recording need more than {_ROOM} bytes")
+            self._varying[key] = place, write
+        return self._varying[key][0]
+
+    def _renew(self) -> None:
+        """Write what varies, at once."""
+        content = np.zeros(self._used, np.uint8)
+        for place, write in self._varying.values():
+            content[place.offset : place.offset + place.nbytes] = np.frombuffer(write(), np.uint8)
+        self._uniforms.rows(0, self._used).write(content)
+
+
+class Later:
+    """Copies of small arrays, which commands make, and which `read` gives without a wait for what was submitted since.
+
+    The arrays' sizes are multiples of 4 bytes. ring: buffers that earlier ones have read, and that are used again.
+    """
+
+    def __init__(self, commands: Commands, arrays: Sequence[DeviceArray], ring: list[Any]) -> None:
+        self._device, self._arrays, self._ring = commands.device, arrays, ring
+        *self._starts, self._nbytes = itertools.accumulate((array.nbytes for array in arrays), initial=0)
+        self._buffer = next((buffer for buffer in ring if buffer.size >= self._nbytes), None)
+        if self._buffer is not None:
+            ring.remove(self._buffer)
+        else:
+            with translated_errors(self._device, "what is read later", self._nbytes):
+                self._buffer = self._device.wgpu_device.create_buffer(
+                    label="later", size=self._nbytes, usage=wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.COPY_DST
+                )
+        for array, start in zip(arrays, self._starts, strict=True):
+            commands.copy_out(array, self._buffer, start)
+        self._mapping: native.Mapping
+
+    def submitted(self) -> None:
+        """Ask for the copies, after the submission that makes them."""
+        with translated_errors(self._device, "what is read later"):
+            self._mapping = native.Mapping(self._device, self._buffer, 0, self._nbytes)
+
+    def read(self) -> list[NDArray[Any]]:
+        """The arrays' contents. Raises DeviceError where the device does not give them."""
+        with translated_errors(self._device, "what is read later"):
+            self._mapping.wait()
+            check_not_lost(self._device)  # the native library would end the process
+            with self._mapping as mapped:
+                parts = np.split(mapped.copy(), self._starts[1:])
+        self._ring.append(self._buffer)
+        return [part.view(array.dtype).reshape(array.shape) for part, array in zip(parts, self._arrays, strict=True)]

@@ -66,26 +66,12 @@ class Matmul:
 
     def _dispatch(self, commands: Commands, a: Matrix, b: Matrix, c: Matrix, split: int, *, add: bool = False) -> None:
         kernel = Kernel.get(self._device, "matmul", ADD=add, A_INNER=not a.transposed, B_INNER=b.transposed)
-        content = kernel.uniform(
-            "Matmul",
-            rows=c.rows,
-            columns=c.columns,
-            inner=a.columns,
-            split=split,
-            a_stride=a.stride,
-            b_stride=b.stride,
-            c_stride=c.stride,
-            c_part=c.rows * c.columns,
-            first=(a.first, b.first, c.first, 0),
-        )
-        commands.dispatch(
-            kernel,
-            -(-c.rows // _TILE) * -(-c.columns // _TILE) * -(-a.columns // split),
-            product=self._pool.constant(content),
-            a=a.array,
-            b=b.array,
-            c=c.array,
-        )
+        sizes = {"rows": c.rows, "columns": c.columns, "inner": a.columns, "split": split}
+        places = {"a_stride": a.stride, "b_stride": b.stride, "c_stride": c.stride, "c_part": c.rows * c.columns}
+        first = (a.first, b.first, c.first, 0)
+        product = self._pool.constant(kernel.uniform("Matmul", **sizes, **places, first=first))
+        groups = -(-c.rows // _TILE) * -(-c.columns // _TILE) * -(-a.columns // split)
+        commands.dispatch(kernel, groups, product=product, a=a.array, b=b.array, c=c.array)
 
 
 def sum_columns(

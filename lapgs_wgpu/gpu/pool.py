@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.gpu.array import DeviceArray
-from lapgs_wgpu.gpu.buffer import Buffer
+from lapgs_wgpu.gpu.array import Buffer, DeviceArray
 from lapgs_wgpu.gpu.device import Device
 
 _MOST_CONSTANTS = 1024  # of a pool: those of earlier sizes accumulate
@@ -46,8 +45,7 @@ class BufferPool:
         if content not in self._constants:
             if len(self._constants) >= _MOST_CONSTANTS:
                 self._constants.clear()
-            array = DeviceArray.upload(self.device, "constant", np.frombuffer(content, np.uint8))
-            self._constants[content] = array
+            self._constants[content] = DeviceArray.upload(self.device, "constant", np.frombuffer(content, np.uint8))
         return self._constants[content]
 
     def varying(self, name: str, write: Callable[[], bytes]) -> DeviceArray:

@@ -52,9 +52,7 @@ class RadixSort:
         counters = self._pool.array(f"{self._name} counters", (digits * owners,), "uint32")
         keys_out = self._pool.array(f"{self._name} keys", (capacity,), "uint32")
         payload_out = self._pool.array(f"{self._name} payload", (capacity,), "uint32")
-        second_payload = payload
-        if second_payload is None:
-            second_payload = self._pool.array(f"{self._name} second payload", (capacity,), "uint32")
+        second_payload = payload or self._pool.array(f"{self._name} second payload", (capacity,), "uint32")
         groups = owners // 8 if self._lane_runs else owners
         count_kernel = Kernel.get(self._device, "sort_count", LANE_RUNS=self._lane_runs)
         for step in range(passes):

@@ -35,7 +35,7 @@ class Scan:
         """Record prefix[i] = sum of the first i elements, total[0] = sum of all; elements = length[0] <= capacity."""
         count = max(1, -(-capacity // _BLOCK_ITEMS))
         sums = self._pool.array(f"{self._name} block sums", (count,), "uint32")
-        source = {"length": length, "values": values} | ({} if indices is None else {"indices": indices})
+        arrays = {"length": length, "values": values, "indices": indices, "block_sums": sums}
         if count > 1:
-            commands.dispatch(self._reduce, count, **source, block_sums=sums)
-        commands.dispatch(self._apply, count, **source, block_sums=sums, prefix=prefix, total=total)
+            commands.run(self._reduce, count, arrays)
+        commands.run(self._apply, count, {**arrays, "prefix": prefix, "total": total})

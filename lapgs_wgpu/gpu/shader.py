@@ -135,18 +135,12 @@ def _table(argument: str, texture: bool, file: str) -> str:
     if parts is None or parts[3] not in TABLE_TYPES:
         raise ShaderError(f"shaders/{file}.wgsl: cannot read #table {argument}")
     number, name, kind = parts.groups()
-    declaration = f"@group(0) @binding({number}) var"
-    if not texture:
-        return (
-            f"{declaration}<storage, read> {name}: array<{kind}>;\n"
-            f"fn {name}_at(i: u32) -> {kind} {{ return {name}[i]; }}"
-        )
-    texel_format, _, components = TABLE_TYPES[kind]
-    texel = f"textureLoad({name}, vec2(i % {TABLE_WIDTH}u, i / {TABLE_WIDTH}u))"
-    return (
-        f"{declaration} {name}: texture_storage_2d<{texel_format}, read>;\n"
-        f"fn {name}_at(i: u32) -> {kind} {{ return {texel}{components}; }}"
-    )
+    declaration, value = f"var<storage, read> {name}: array<{kind}>", f"{name}[i]"
+    if texture:
+        texel_format, _, components = TABLE_TYPES[kind]
+        declaration = f"var {name}: texture_storage_2d<{texel_format}, read>"
+        value = f"textureLoad({name}, vec2(i % {TABLE_WIDTH}u, i / {TABLE_WIDTH}u)){components}"
+    return f"@group(0) @binding({number}) {declaration};\nfn {name}_at(i: u32) -> {kind} {{ return {value}; }}"
 
 
 def _substitute(text: str, defines: Defines, file: str) -> str:
@@ -176,9 +170,8 @@ def reflect(source: str) -> dict[str, Binding]:
     """Return the bindings of group 0 in composed WGSL, by name."""
     found = {}
     for number, space, access, name, kind in _BINDING.findall(source):
-        found[name] = Binding(
-            int(number), name, "uniform" if space == "uniform" else (access or "read"), "".join(kind.split())
-        )
+        access = "uniform" if space == "uniform" else access or "read"
+        found[name] = Binding(int(number), name, access, "".join(kind.split()))
     for number, name, texel_format in _TEXTURE.findall(source):
         found[name] = Binding(int(number), name, "texture", texel_format)
     return found

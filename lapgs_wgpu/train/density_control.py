@@ -45,9 +45,8 @@ class DensityControl:
         scene = self._scene
         rows = {name: row.detach() for name, row in scene.parameters.items()}
         extent = self._learners.dataset.extent
-        change = self._learners.parts.density(
-            DensityState(step, rows, self.statistics, self._config, extent, self._generator)
-        )
+        state = DensityState(step, rows, self.statistics, self._config, extent, self._generator)
+        change = self._learners.parts.density(state)
         check_change(change, rows)
         if not change.keep.any() and len(change.added["means"]) == 0:
             raise InputError(f"no Gaussian is left at step {step}; raise density.max_world_size (0 switches it off).")

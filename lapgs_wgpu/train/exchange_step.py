@@ -40,14 +40,16 @@ class ExchangeStep:
         d_means2d = rendering.means2d.grad
         assert d_means2d is not None
         began()
-        if what := self._not_finite(measured, d_means2d):
-            self._learners.zero_grad()
-            measured = measured._replace(skipped=Skipped(step, view.name, what))
-        else:
+        parameters, gradients = self._learners.parameters(), self._learners.gradients()
+        gradients["the places in the image"] = [d_means2d]
+        if math.isfinite(measured.loss) and finite(parameters, gradients):
             self._learners.step(step, scheduled.share)
             # After the optimizer's step, so that no gradient is lost with the rows that change.
             if scheduled.seen:
                 self._density.statistics.add(rendering.radii, d_means2d, view.camera)
+        else:
+            check_parameters(parameters)  # whose values a step cannot mend
+            measured = measured._replace(skipped=Skipped(step, view.name, cause(measured.terms, gradients)))
         return lambda: measured
 
     def _compared(self, scheduled: Scheduled, t: float) -> tuple[Nearby | None, TimeSamples | None]:
@@ -105,15 +107,3 @@ class ExchangeStep:
         terms = {name: factors[name] * value for name, value in rendering.terms.items() if name in factors}
         terms |= {name: value.item() for name, value in of_motion.items()}
         return Measured(loss.item(), psnr_of(rendering.terms["mse"]), terms=terms), rendering
-
-    def _not_finite(self, measured: Measured, d_means2d: Tensor) -> str:
-        """What is not finite in the loss and gradients of a step, for which it is skipped; "" where all is well.
-
-        Raises NumericalError for a parameter, whose values a step cannot mend.
-        """
-        parameters, gradients = self._learners.parameters(), self._learners.gradients()
-        gradients["the places in the image"] = [d_means2d]
-        if math.isfinite(measured.loss) and finite(parameters, gradients):
-            return ""
-        check_parameters(parameters)
-        return cause(measured.terms, gradients)

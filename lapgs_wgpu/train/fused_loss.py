@@ -82,11 +82,11 @@ def render_loss(
             rows.append(d_correction)
         back = rasterizer.backward(drawing, d_image, camera=camera_change is not None)
         rows += [] if back.camera is None else [back.camera]
-        found = iter(read_all([sums, drawing.splats, *back.arrays(), *rows, *drawing.needed]))
-        values, splats, d_gaussians = next(found), next(found), [next(found) for _ in back.arrays()]
-        d_rows = [next(found) for _ in rows]
+        read = iter(read_all([sums, drawing.splats, *back.arrays(), *rows, *drawing.needed]))
+        values, splats, d_gaussians = next(read), next(read), [next(read) for _ in back.arrays()]
+        d_rows = [next(read) for _ in rows]
         # Where the intersections did not fit, none of this is right, and all of it is done again.
-        if not rasterizer.grow_on_overflow(drawing, list(found)):
+        if not rasterizer.grow_on_overflow(drawing, list(read)):
             break
     by_gaussians, d_means2d = gradient_tensors(d_gaussians, gaussians.opacities.detach())
     by_correction = by_camera = None
@@ -98,13 +98,12 @@ def render_loss(
     radii, means2d = radii_and_centres(splats, gaussians.means.device)
     means2d.requires_grad_()
     computed = np.append(values.astype(np.float64), own_values)
-    factors = [weights.l1, 0, weights.ssim, weights.pyramid, weights.ncc, *(weight for _, weight in own)]
+    factors = {"l1": weights.l1, "mse": 0.0, **weights._asdict(), **{term.name: weight for term, weight in own}}
     gradients = (*by_gaussians, by_correction, by_camera, d_means2d)
     differentiable = (*gaussians.arrays().values(), correction, camera_change, means2d)
-    loss = _Computed.apply(float(np.dot(computed, factors)), gradients, *differentiable)
-    names = ("l1", "mse", "ssim", "pyramid", "ncc", *(term.name for term, _ in own))
-    used = (True, True, weights.ssim, weights.pyramid, weights.ncc, *[True] * len(own))
-    terms = {name: value for name, value, use in zip(names, computed.tolist(), used, strict=True) if use}
+    loss = _Computed.apply(float(np.dot(computed, [*factors.values()])), gradients, *differentiable)
+    found = zip(factors.items(), computed.tolist(), strict=True)
+    terms = {name: value for (name, factor), value in found if factor or name in ("l1", "mse")}
     return RenderLoss(loss, terms, radii, means2d)
 
 

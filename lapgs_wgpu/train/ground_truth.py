@@ -5,7 +5,6 @@ The image then stays on the device; the host reads it back where it needs it.
 """
 
 import os
-from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
@@ -33,7 +32,7 @@ class GroundTruth:
 
     def __init__(self, device: Device, color: Tensor, max_bytes: int) -> None:
         self._device, self.color, self._max_bytes = device, color, max_bytes
-        self._kept: OrderedDict[View, DeviceArray] = OrderedDict()
+        self._kept: dict[View, DeviceArray] = {}  # that used last at the end
         self._coming: dict[View, Future[NDArray[np.uint8]]] = {}
         self._threads = ThreadPoolExecutor(DECODERS, thread_name_prefix="decode")
 
@@ -58,7 +57,7 @@ class GroundTruth:
             array = upload_rgba(self._device, coming.result() if coming else marked_pixels(view, self.color))
         if array.buffer.nbytes <= self._max_bytes:
             while self.used_bytes + array.buffer.nbytes > self._max_bytes:
-                self._kept.popitem(last=False)
+                del self._kept[next(iter(self._kept))]
             self._kept[view] = array
         return array
 

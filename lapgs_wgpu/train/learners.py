@@ -13,7 +13,6 @@ from lapgs_wgpu.train.exposure import Exposures
 from lapgs_wgpu.train.optimizer import FrequencyOptimizer, Optimizer
 from lapgs_wgpu.train.parts import Parts
 from lapgs_wgpu.train.setup import Start, max_field_rates, nyquist_frequency
-from lapgs_wgpu.train.step_result import Tensors
 
 
 class Learners:
@@ -82,20 +81,19 @@ class Learners:
         exposures = self.exposures
         return None if exposures is None else exposures.values[self.image_numbers[view.name]]
 
-    def parameters(self) -> Tensors:
+    def parameters(self) -> dict[str, list[Tensor]]:
         """All that learns, by group."""
         return {**self.optimizer.parameters(), **{each.name: [each.values] for each in self._refiners()}}
 
     def gradients(self) -> dict[str, list[Tensor]]:
         """Of all parameters that have one, by group."""
-        gradients = self.optimizer.gradients()
-        return gradients | {each.name: [each.values.grad] for each in self._refiners() if each.values.grad is not None}
+        return {name: [p.grad for p in group if p.grad is not None] for name, group in self.parameters().items()}
 
     def zero_grad(self) -> None:
         """Forget the gradients."""
-        self.optimizer.zero_grad()
-        for each in self._refiners():
-            each.values.grad = None
+        for group in self.parameters().values():
+            for parameter in group:
+                parameter.grad = None
 
     def step(self, step: int, share: float) -> None:
         """Move all that has a gradient, the Gaussians and the field at a share of the rates of this step."""

@@ -20,7 +20,8 @@ class Optimizer:
     field: group -> parameters, such as the field's `parameter_groups()`. rates: the schedule of each name and group.
     highest: name or group -> rate that it never exceeds. The same gradients in the same order give the same bits.
     on_access: called with "gaussians" or "field" before the state of these, or they with it, are read or changed from
-    outside, without a name for both: a device may have newer ones.
+    outside, without a name for both: a device may have newer ones. states: of Adam, by parameter, from its first step
+    on: step, exp_avg and exp_avg_sq.
     """
 
     def __init__(
@@ -34,18 +35,11 @@ class Optimizer:
         # Fused: one pass over the memory, 2.5 times as fast as the others on the dnerf preset's hash tables.
         named = [{"params": parameters, "name": name} for name, parameters in groups.items()]
         self._adam = torch.optim.Adam(named, lr=0.0, eps=ADAM_EPS, fused=True)
-
-    def zero_grad(self) -> None:
-        """Forget the gradients."""
-        self._adam.zero_grad(set_to_none=True)
+        self.states: dict[Tensor, dict[str, Tensor]] = self._adam.state
 
     def parameters(self) -> dict[str, list[Tensor]]:
         """All that it moves, by group."""
         return {group["name"]: list(group["params"]) for group in self._adam.param_groups}
-
-    def gradients(self) -> dict[str, list[Tensor]]:
-        """Of those parameters that have one, by group."""
-        return {name: [p.grad for p in group if p.grad is not None] for name, group in self.parameters().items()}
 
     def rates_at(self, step: int, share: float = 1.0) -> dict[str, float]:
         """The learning rate of each group in a step, counted from 1: a share of its schedule's."""
@@ -72,9 +66,8 @@ class Optimizer:
         self.on_access("gaussians")
         for name, old in self.gaussians.items():
             new = old.detach()[:0] if added is None else added[name]
-            moments = {
-                key: torch.cat([moment[rows], torch.zeros_like(new)]) for key, moment in self.moments(name).items()
-            }
+            zeros = torch.zeros_like(new)
+            moments = {key: torch.cat([moment[rows], zeros]) for key, moment in self.moments(name).items()}
             self._replace(name, torch.cat([old.detach()[rows], new]), moments)
 
     def reset(self, name: str, values: Tensor) -> None:
@@ -84,7 +77,7 @@ class Optimizer:
 
     def moments(self, name: str) -> dict[str, Tensor]:
         """Adam's exp_avg and exp_avg_sq of one of the Gaussians' parameters, shaped like it; empty before any step."""
-        return {key: value for key, value in self.state_of(self.gaussians[name]).items() if key != "step"}
+        return {key: value for key, value in self.states.get(self.gaussians[name], {}).items() if key != "step"}
 
     def state(self) -> dict[str, Tensor]:
         """Everything that the next step depends on, besides the parameters and their gradients."""
@@ -93,7 +86,7 @@ class Optimizer:
             f"{group['name']}.{i}.{key}": value
             for group in self._adam.param_groups
             for i, parameter in enumerate(group["params"])
-            for key, value in self._adam.state.get(parameter, {}).items()
+            for key, value in self.states.get(parameter, {}).items()
         }
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
@@ -108,21 +101,13 @@ class Optimizer:
                 if mine and found != shapes:
                     raise ValueError(f"its {prefix[:-1]} holds {found}")
                 if mine:
-                    self._adam.state[parameter] = mine
-
-    def state_of(self, parameter: Tensor) -> dict[str, Tensor]:
-        """Adam's step, exp_avg and exp_avg_sq of a parameter; empty before the first step that moves it."""
-        return self._adam.state.get(parameter, {})
-
-    def set_state(self, parameter: Tensor, steps: int, mean: Tensor, square: Tensor) -> None:
-        """Go on with this state of a parameter."""
-        self._adam.state[parameter] = {"step": torch.tensor(float(steps)), "exp_avg": mean, "exp_avg_sq": square}
+                    self.states[parameter] = mine
 
     def _replace(self, name: str, values: Tensor, moments: Mapping[str, Tensor]) -> None:
-        state = self._adam.state.pop(self.gaussians[name], {})
+        state = self.states.pop(self.gaussians[name], {})
         parameter = self.gaussians[name] = nn.Parameter(values)
         if state:
-            self._adam.state[parameter] = {**state, **moments}
+            self.states[parameter] = {**state, **moments}
         next(group for group in self._adam.param_groups if group["name"] == name)["params"] = [parameter]
 
 
@@ -133,23 +118,17 @@ class FrequencyOptimizer:
     which eq. 5 favours the faint components, away again. limit: the Nyquist frequency, cycles over the clip.
     """
 
-    def __init__(self, motion: LaplacianMotion, rate: Rate, limit: float) -> None:
-        self._motion, self.rate, self.limit = motion, rate, limit
-        self._mean = torch.zeros_like(motion.frequencies)
-        self._square, self._steps = torch.zeros((), dtype=torch.float64), torch.tensor(0)
-
     name = "frequencies"
 
-    @property
-    def values(self) -> Tensor:
-        """The frequencies."""
-        return self._motion.frequencies
+    def __init__(self, motion: LaplacianMotion, rate: Rate, limit: float) -> None:
+        self._motion, self.values, self.rate, self.limit = motion, motion.frequencies, rate, limit
+        self._mean = torch.zeros_like(motion.frequencies)
+        self._square, self._steps = torch.zeros((), dtype=torch.float64), torch.tensor(0)
 
     @torch.no_grad()
     def step(self, step: int) -> None:
         """Move the frequencies, if they have a gradient, at the rate of this step (counted from 1), and forget it."""
-        frequencies = self._motion.frequencies
-        if frequencies.grad is None:
+        if self.values.grad is None:
             return
         gradient = self._motion.frequency_gradient()
         self._steps += 1
@@ -158,8 +137,8 @@ class FrequencyOptimizer:
         mean = self._mean / (1 - 0.9 ** int(self._steps))
         size = (float(self._square) / (1 - 0.999 ** int(self._steps))) ** 0.5
         move = self.rate.at(step) * mean / (size + ADAM_EPS)
-        frequencies.sub_(move.clamp(-LARGEST_FREQUENCY_STEP, LARGEST_FREQUENCY_STEP)).clamp_(0.0, self.limit)
-        frequencies.grad = None
+        self.values.sub_(move.clamp(-LARGEST_FREQUENCY_STEP, LARGEST_FREQUENCY_STEP)).clamp_(0.0, self.limit)
+        self.values.grad = None
 
     def state(self) -> dict[str, Tensor]:
         """Everything that the next step depends on, besides the frequencies and their gradient."""

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -59,12 +58,6 @@ class TorchLoss(LossTerm):
     """
 
 
-# Names of the terms of the configuration, and of what stands beside them in the log.
-TAKEN_NAMES = frozenset(
-    {"l1", "mse", "ssim", "pyramid", "ncc", "smoothness", "acceleration", "dynamics", "loss", "psnr"}
-)
-
-
 @dataclass(frozen=True)
 class Parts:
     """Parts of a training that are Python objects.
@@ -87,13 +80,14 @@ class Parts:
     callbacks: Sequence[Callback] = ()
 
     def __post_init__(self) -> None:
-        names = Counter(TAKEN_NAMES)
+        # By the terms of the configuration, and by what stands beside them in the log.
+        taken = {"l1", "mse", "ssim", "pyramid", "ncc", "smoothness", "acceleration", "dynamics", "loss", "psnr"}
         for term in self.losses:
             if not isinstance(term, LossTerm):
                 raise InputError(f"Parts(losses=...) must list Regularizer and TorchLoss, got a {type(term).__name__}.")
-            names[term.name] += 1
-            if names[term.name] > 1:
+            if term.name in taken:
                 raise InputError(f"there are two loss terms named {term.name!r}; give each a name of its own.")
+            taken.add(term.name)
         for name, rate in self.rates.items():
             number = isinstance(rate, int | float) and 0 <= rate < math.inf
             if not number and not isinstance(rate, Rate):

@@ -1,5 +1,6 @@
 """The corrections of cameras and colors in device arrays, and the passes of a resident step that use and move them."""
 
+import numpy as np
 import torch
 
 from lapgs_wgpu.data.views import View
@@ -7,28 +8,27 @@ from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.matmul import sum_columns
 from lapgs_wgpu.gpu.pool import BufferPool
-from lapgs_wgpu.train.camera_refinement import MOST_POINTS, CameraRefinement
+from lapgs_wgpu.train.camera_refinement import MOST_POINTS, CameraRefinement, Pace
 from lapgs_wgpu.train.exposure import Exposures
 from lapgs_wgpu.train.fused_loss import exposure_of
 from lapgs_wgpu.train.learners import Learners
-from lapgs_wgpu.train.resident_parameters import Block, check_finite
+from lapgs_wgpu.train.resident_parameters import Block, Place, check_finite
 
 _CAMERA_FLOATS, _EXPOSURE_FLOATS = 16, 40  # rows of camera_step.wgsl and exposure_step.wgsl
 _MOTION_FLOATS, _MOST_COMMON = 22, 8  # image_motion.wgsl, camera_step.wgsl
-_EVERY, _CAMERAS, _ALL = slice(None), slice(-1), slice(-1, None)
-_PLACES = {
+_PLACES: dict[str, dict[str, Place]] = {
     "cameras": {
-        "learnt": (_CAMERAS, slice(0, 6)),
-        "mean": (_CAMERAS, slice(6, 12)),
-        "steps": (_CAMERAS, slice(12, 13)),
-        "square": (_ALL, slice(0, 1)),
-        "moves": (_ALL, slice(1, 2)),
+        "learnt": np.s_[:-1, :6],
+        "mean": np.s_[:-1, 6:12],
+        "steps": np.s_[:-1, 12:13],
+        "square": np.s_[-1:, 0:1],
+        "moves": np.s_[-1:, 1:2],
     },
     "exposure": {
-        "values": (_EVERY, slice(0, 12)),
-        "mean": (_EVERY, slice(12, 24)),
-        "square": (_EVERY, slice(24, 36)),
-        "steps": (_EVERY, slice(36, 37)),
+        "values": np.s_[:, :12],
+        "mean": np.s_[:, 12:24],
+        "square": np.s_[:, 24:36],
+        "steps": np.s_[:, 36:37],
     },
 }
 
@@ -52,6 +52,7 @@ class ResidentCorrections:
         if self._exposures is not None:
             self._exposure_rows = self._add(self._exposures, (len(self._exposures.values), _EXPOSURE_FLOATS))
         self._d_camera, self._d_exposure = self._pool.array("d_camera", (8,)), self._pool.array("d_exposure", (12,))
+        self._pace: Pace | None = None
         self.on_host = True
 
     def _add(self, of: CameraRefinement | Exposures, shape: tuple[int, int]) -> DeviceArray:
@@ -76,8 +77,9 @@ class ResidentCorrections:
 
     def begin(self, view: View, step: int) -> None:
         """Say what is recorded or replayed next: a step, counted from 1, and its view."""
-        self._view, self._step = view, step
-        self._pace = None if self._cameras is None else self._cameras.pace(step)
+        self._step, self._image = step, self._numbers[view.name]
+        if self._cameras is not None:
+            self._camera, self._pace = self._cameras.numbers[view.camera], self._cameras.pace(step)
 
     @property
     def moves_camera(self) -> bool:
@@ -88,18 +90,13 @@ class ResidentCorrections:
 
     def move(self, commands: Commands, frame: DeviceArray, band: int) -> DeviceArray:
         """Record the frame of a band's passes with the view's camera corrected."""
-        cameras = self._cameras
-        if cameras is None:
+        if self._cameras is None:
             return frame
-        kernel = Kernel.get(self._device, "move_camera")
-
-        def write() -> bytes:
-            return kernel.uniform("Moved", row=cameras.numbers[self._view.camera], unit=cameras.extent)
-
-        moved = self._pool.array(f"frame {band}", frame.shape, frame.dtype)
-        given = {"moved": self._pool.varying("moved", write), "placed": frame, "cameras": self._camera_rows}
-        commands.dispatch(kernel, 1, **given, frame=moved)
-        return moved
+        kernel, unit = Kernel.get(self._device, "move_camera"), self._cameras.extent
+        moved = self._pool.varying("moved", lambda: kernel.uniform("Moved", row=self._camera, unit=unit))
+        corrected = self._pool.array(f"frame {band}", frame.shape, frame.dtype)
+        commands.dispatch(kernel, 1, moved=moved, placed=frame, cameras=self._camera_rows, frame=corrected)
+        return corrected
 
     def expose(self, commands: Commands, image: DeviceArray) -> DeviceArray:
         """Record the image with its colors corrected."""
@@ -136,32 +133,30 @@ class ResidentCorrections:
             self._step_camera(commands, guard, frame, geometry)
         if (exposures := self._exposures) is None:
             return
-        kernel = Kernel.get(self._device, "exposure_step")
+        kernel, count = Kernel.get(self._device, "exposure_step"), len(exposures.values)
 
         def write() -> bytes:
-            count, rate = len(exposures.values), exposures.rate.at(self._step)
-            return kernel.uniform("ExposureStep", number=self._numbers[self._view.name], count=count, rate=rate)
+            return kernel.uniform("ExposureStep", number=self._image, count=count, rate=exposures.rate.at(self._step))
 
         arrays = {"guard": guard, "d_exposure": self._d_exposure, "exposures": self._exposure_rows}
         commands.dispatch(kernel, 1, descent=self._pool.varying("exposure step", write), **arrays)
 
     def _step_camera(self, commands: Commands, guard: DeviceArray, frame: DeviceArray, geometry: DeviceArray) -> None:
-        cameras, count = self._cameras, geometry.shape[0]
-        assert cameras is not None
+        assert self._cameras is not None
+        unit, cameras, count = self._cameras.extent, len(self._cameras.numbers), geometry.shape[0]
         motion, motion_kernel = self._pool.array("motion", (_MOTION_FLOATS,)), Kernel.get(self._device, "image_motion")
-        content = motion_kernel.uniform("Seen", gaussians=count, spacing=-(-count // MOST_POINTS), unit=cameras.extent)
+        content = motion_kernel.uniform("Seen", gaussians=count, spacing=-(-count // MOST_POINTS), unit=unit)
         seen = self._pool.constant(content)
         commands.dispatch(motion_kernel, 1, seen=seen, frame=frame, geometry=geometry, motion=motion)
         kernel = Kernel.get(self._device, "camera_step")
 
         def write() -> bytes:
             assert self._pace is not None
-            number, pace = cameras.numbers[self._view.camera], self._pace._asdict()
-            return kernel.uniform("CameraStep", number=number, cameras=len(cameras.numbers), **pace)
+            return kernel.uniform("CameraStep", number=self._camera, cameras=cameras, **self._pace._asdict())
 
         arrays = {"guard": guard, "motion": motion, "d_camera": self._d_camera, "common_motions": self._common}
         descent = self._pool.varying("camera step", write)
         commands.dispatch(kernel, 1, descent=descent, cameras=self._camera_rows, **arrays)
 
     def _first_row(self) -> int:
-        return self._numbers[self._view.name] * _EXPOSURE_FLOATS // 4
+        return self._image * _EXPOSURE_FLOATS // 4

@@ -4,7 +4,7 @@ Between two looks of the host the device has the newest values. Whoever reads to
 next step pushes what the host may have changed.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -46,14 +46,11 @@ class Block:
     moving: bool = True
     arrays: dict[str, DeviceArray] = field(default_factory=dict)
 
-    @property
-    def rate_columns(self) -> int:
-        """Number of columns with a rate of their own."""
-        return self.shape[1] if self.group is None else 1
-
     def gather(self, tensors: Mapping[str, Tensor | None]) -> NDArray[np.float32]:
         """The content for the device; tensors that are None are zeros."""
         out = np.zeros(self.shape, np.float32)
+        if self.ones:
+            out[:, -1] = 1.0
         for name, place in self.parts.items():
             tensor = tensors[name]
             if tensor is not None:
@@ -76,7 +73,7 @@ class ResidentParameters:
     def __init__(self, learners: Learners, weights: GridFieldPasses | None) -> None:
         scene = learners.scene
         self._device, self._pool, self._weights = scene.device, BufferPool(scene.device), weights
-        self._optimizer, self._frequencies = learners.optimizer, learners.frequencies
+        self._states, self._frequencies = learners.optimizer.states, learners.frequencies
         tensors = dict(scene.field.named_parameters()) if scene.field is not None else {}
         self._tensors: dict[str, Mapping[str, Tensor]] = {"gaussians": scene.parameters, "field": tensors}  # by part
         self._blocks_of: dict[str, list[Block]] = {}  # by part
@@ -86,19 +83,10 @@ class ResidentParameters:
 
     # The host's tensors and the device's arrays ----------------------------------------------------------------------
 
-    def _lay_out(self, part: str) -> None:
-        """Make arrays for the tensors of a part as they are."""
-        self._blocks_of[part] = self._gaussians_layout() if part == "gaussians" else self._field_layout()
-        for block in self._blocks_of[part]:
-            block.arrays = {kind: self._pool.array(f"{block.name} {kind}", block.shape) for kind in KINDS}
-
     def _write(self, part: str, kind: str, tensors: Mapping[str, Tensor | None]) -> None:
         """Upload all of a kind; tensors that are None are zeros."""
         for block in self._blocks_of[part]:
-            values = block.gather(tensors)
-            if block.ones and kind == "value":
-                values[:, -1] = 1.0
-            block.arrays[kind].write(values)
+            block.arrays[kind].write(block.gather(tensors))
 
     def _read(self, part: str, kind: str, into: Mapping[str, Tensor]) -> None:
         """Copy all of a kind into tensors."""
@@ -107,46 +95,48 @@ class ResidentParameters:
             block.scatter(content, into)
 
     def _gaussians_layout(self) -> list[Block]:
-        gaussians, every = self._tensors["gaussians"], slice(None)
+        gaussians = self._tensors["gaussians"]
         n = len(gaussians["means"])
-        columns = {"means": (0, 3), "opacity_logits": (3, 4), "quats": (4, 8), "log_scales": (8, 11)}
-        geometry = {name: (every, slice(*place)) for name, place in columns.items()}
-        colors = {"sh_dc": (every, slice(0, 3)), "sh_rest": (every, slice(3, SH_FLOATS))}
+        geometry = {"means": np.s_[:, :3], "opacity_logits": np.s_[:, 3:4]}
+        geometry |= {"quats": np.s_[:, 4:8], "log_scales": np.s_[:, 8:11]}
+        colors = {"sh_dc": np.s_[:, :3], "sh_rest": np.s_[:, 3:]}
         blocks = [
             Block("geometry", (n, GEOMETRY_FLOATS), None, geometry, moving=False),
             Block("sh", (n, SH_FLOATS), None, colors, moving=False),
         ]
         if self._weights is not None:
             size = self._weights.dynamics
-            dynamics = {"dynamics": (every, slice(0, size))} if "dynamics" in gaussians else {}
+            dynamics = {"dynamics": np.s_[:, :size]} if "dynamics" in gaussians else {}
             blocks.append(Block("beside", (n, size + 1), None, dynamics, ones=True))
         return blocks
 
     def _field_layout(self) -> list[Block]:
         if self._weights is None:
             return []
-        tensors, every = self._tensors["field"], slice(None)
+        tensors = self._tensors["field"]
         blocks = [
-            Block(name, (table.shape[0], 2), "hash", {name: (every, every)})
+            Block(name, (table.shape[0], 2), "hash", {name: np.s_[:, :]})
             for name, table in tensors.items()
             if name.endswith(".table")
         ]
         places, shape = self._weights.places, (self._weights.count, 1)
-        rows = {name: (slice(first, first + tensors[name].numel()), every) for name, first in places.items()}
+        rows = {name: np.s_[first : first + tensors[name].numel(), :] for name, first in places.items()}
         moved = places.get(FREQUENCIES)
         return [*blocks, Block("weights", shape, "mlp", rows, moved=moved)]
 
     def push_values(self) -> None:
         """Upload the values that the host may have changed."""
-        for part in [part for part in PARTS if part in self.values_on_host]:
-            self._lay_out(part)
+        for part in self.values_on_host:
+            self._blocks_of[part] = self._gaussians_layout() if part == "gaussians" else self._field_layout()
+            for block in self._blocks_of[part]:
+                block.arrays = {kind: self._pool.array(f"{block.name} {kind}", block.shape) for kind in KINDS}
             self._write(part, "value", self._tensors[part])
 
     def push(self) -> None:
         """Upload what the host may have changed; from now on the device has the newest."""
         self.push_values()
-        for part in [part for part in PARTS if part in self.state_on_host]:
-            state = {name: self._optimizer.state_of(tensor) for name, tensor in self._tensors[part].items()}
+        for part in self.state_on_host:
+            state = {name: self._states.get(tensor, {}) for name, tensor in self._tensors[part].items()}
             self.steps |= {name: int(each.get("step", 0)) for name, each in state.items()}
             for kind, key in (("mean", "exp_avg"), ("square", "exp_avg_sq")):
                 self._write(part, kind, {name: each.get(key) for name, each in state.items()})
@@ -161,22 +151,23 @@ class ResidentParameters:
     def pull(self, *parts: str, state: bool) -> None:
         """Make torch's tensors of some parts, of all if none is named, the newest ones. state: and the optimizers'."""
         for part in set(parts or PARTS) - self.values_on_host:
-            self.values_on_host.add(part)
             self._read(part, "value", self._tensors[part])
+            self.values_on_host.add(part)
         for part in set(parts or PARTS) - self.state_on_host if state else ():
-            self.state_on_host.add(part)
             tensors = self._tensors[part]
             means, squares = ({name: torch.zeros_like(tensor) for name, tensor in tensors.items()} for _ in range(2))
             self._read(part, "mean", means)
             self._read(part, "square", squares)
             for name, tensor in tensors.items():
                 if self.steps[name] and name != FREQUENCIES:
-                    self._optimizer.set_state(tensor, self.steps[name], means[name], squares[name])
+                    steps = torch.tensor(float(self.steps[name]))
+                    self._states[tensor] = {"step": steps, "exp_avg": means[name], "exp_avg_sq": squares[name]}
             if part == "field" and self._frequencies is not None:
                 moments, own = self._frequency_state.read(), self._frequencies.state()
                 own["mean"].copy_(torch.from_numpy(moments[:-1]))
                 own["square"].fill_(float(moments[-1]))
                 own["steps"].fill_(self.steps[FREQUENCIES])
+            self.state_on_host.add(part)
 
     @property
     def blocks(self) -> dict[str, Block]:
@@ -206,50 +197,45 @@ class ResidentParameters:
         for block in self._moved(moving=moving):
             check_finite(commands, self._pool, block.arrays["gradient"], bad)
 
-    def count_step(self, *, moving: bool) -> None:
-        """A step that moves the parameters is about to be recorded."""
+    def begin(self, rates: Mapping[str, float], *, moving: bool) -> None:
+        """Say what is recorded or replayed next: a step at these rates of the optimizer's groups and of FREQUENCIES."""
+        self._rates = rates
         for block in self._moved(moving=moving):
             for name in block.parts:
                 self.steps[name] += 1
 
-    def _rates(self, block: Block, rates_of: Callable[[], Mapping[str, float]]) -> bytes:
-        """The corrected rates of a step, a pair for each column that has its own."""
-        table, rates = np.zeros((block.rate_columns, 2), np.float32), rates_of()
-        for name, (_, place) in block.parts.items():
+    def _rates_of(self, block: Block) -> bytes:
+        """The corrected rates of a step, a pair for each column."""
+        table = np.zeros((block.shape[1], 2), np.float32)
+        for name, (_, columns) in block.parts.items():
             if name != FREQUENCIES:
-                columns = place if block.group is None else 0
-                table[columns] = _corrected(rates[block.group or name], self.steps[name])
+                table[columns] = _corrected(self._rates[block.group or name], self.steps[name])
         return table.tobytes()
 
-    def record_adam(
-        self, commands: Commands, guard: DeviceArray, rates_of: Callable[[], Mapping[str, float]], *, moving: bool
-    ) -> None:
-        """Record a step of the optimizers, by the rates of its groups and of FREQUENCIES."""
+    def record_adam(self, commands: Commands, guard: DeviceArray, *, moving: bool) -> None:
+        """Record a step of the optimizers."""
         kernel = Kernel.get(self._device, "adam")
         for block in self._moved(moving=moving):
-            written = self._pool.varying(f"rates {block.name}", partial(self._rates, block, rates_of))
-            rates = DeviceArray(written.buffer, (block.rate_columns, 2), offset=written.offset)
+            written = self._pool.varying(f"rates {block.name}", partial(self._rates_of, block))
+            rates = DeviceArray(written.buffer, (block.shape[1], 2), offset=written.offset)
             count = block.arrays["value"].size if block.moved is None else block.moved
-            content = kernel.uniform("Adam", count=count, columns=block.rate_columns, first=0)
+            content = kernel.uniform("Adam", count=count, columns=block.shape[1], first=0)
             arrays = {name: block.arrays[name[:-1]] for name in ("gradients", "values", "means", "squares")}
             adam = self._pool.constant(content)
             commands.dispatch(kernel, -(-count // 256), adam=adam, guard=guard, rates=rates, **arrays)
         if moving and self._frequencies is not None:
-            self._record_frequencies(commands, guard, rates_of)
+            self._record_frequencies(commands, guard, self._frequencies.limit)
 
-    def _record_frequencies(
-        self, commands: Commands, guard: DeviceArray, rates_of: Callable[[], Mapping[str, float]]
-    ) -> None:
+    def _record_frequencies(self, commands: Commands, guard: DeviceArray, limit: float) -> None:
         assert self._weights is not None
-        assert self._frequencies is not None
         kernel, config = Kernel.get(self._device, "adam_frequencies"), self._weights.config
         given = {name: self._weights.places[f"motion.{name}"] for name in ("alpha", "beta", "frequencies")}
         given |= {"width": config.width, "components": config.components}
-        bounds = {"limit": self._frequencies.limit, "largest": LARGEST_FREQUENCY_STEP}
+        bounds = {"limit": limit, "largest": LARGEST_FREQUENCY_STEP}
         bounds |= {"floor": VARIANCE_FLOOR, "spread": VARIANCE_SPREAD}
 
         def write() -> bytes:
-            corrected, factor = _corrected(rates_of()[FREQUENCIES], self.steps[FREQUENCIES])
+            corrected, factor = _corrected(self._rates[FREQUENCIES], self.steps[FREQUENCIES])
             return kernel.uniform("Frequencies", rate=corrected, square_factor=factor, **given, **bounds)
 
         spectrum = self._pool.varying("frequencies uniform", write)

@@ -6,11 +6,9 @@ from typing import Any
 
 from lapgs_wgpu.data.views import View
 from lapgs_wgpu.gpu.array import DeviceArray
-from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.gpu.later import Later
+from lapgs_wgpu.gpu.kernel import Commands, Kernel, Later, Recording
 from lapgs_wgpu.gpu.matmul import sum_columns
 from lapgs_wgpu.gpu.pool import BufferPool
-from lapgs_wgpu.gpu.recording import Recording
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.passes.activation_passes import ActivationPasses, Line
 from lapgs_wgpu.motion.passes.grid_field_passes import Decoding, GridFieldPasses
@@ -59,14 +57,13 @@ class Task:
 
 # The passes of a step: its drawing, and what is read of it later.
 Recorded = tuple[Drawing, list[DeviceArray]]
-# The field at the time of a step, and for the loss of acceleration; None where a step is without.
-Decodings = tuple[Decoding | None, Line | None]
 
 
 class ResidentPasses:
     """Records the passes of the steps of a training.
 
-    parameters, corrections: what the steps move, the latter of cameras and colors.
+    parameters, corrections: what the steps move, the latter of cameras and colors. guard: the word that names the step
+    which may change nothing, nor those behind it; 0 where all is well.
     """
 
     def __init__(self, learners: Learners) -> None:
@@ -78,7 +75,9 @@ class ResidentPasses:
         self._activation = ActivationPasses(scene.device, scene.field_config)
         self.rasterizer, self._losses = rasterizer_of(scene.device), image_loss_of(scene.device)
         self._pool = BufferPool(scene.device)
-        self._recordings: dict[tuple[Any, ...], tuple[Recording, Recorded]] = {}
+        self.guard, self._bad = (self._pool.array(name, (1,), "uint32") for name in ("guard", "bad"))
+        self._totals = self._pool.array("totals", (len(TOTALS),))
+        self._recordings: dict[tuple[Any, ...], Recording[Recorded]] = {}
         level = BACKGROUND_LEVELS[config.data.background]
         self._background, self._checked = (level, level, level), False
         self._dynamics_loss = bool(config.loss.dynamics) and scene.field_config.dynamics_size > 0
@@ -107,15 +106,11 @@ class ResidentPasses:
         """Density control's statistics, (N, 2)."""
         return self._pool.array("statistics", (len(self._scene), 2))
 
-    def word(self, name: str) -> DeviceArray:
-        """A word that passes share: guard or bad."""
-        return self._pool.array(name, (1,), "uint32")
-
     def record(self, commands: Commands, task: Task, truth: DeviceArray) -> Recorded:
         """Record a step. truth: (H, W), of its view."""
         self._task = task
         self.corrections.begin(task.view, task.scheduled.step)
-        self.parameters.count_step(moving=task.scheduled.moving)
+        self.parameters.begin(task.rates, moving=task.scheduled.moving)
         held = self._losses.held(truth)
         commands.copy(truth, held)
         camera = task.view.camera
@@ -124,19 +119,16 @@ class ResidentPasses:
             *(camera.width, camera.height, self.rasterizer.plan_of(camera), len(self._scene)),
             self.corrections.moves_camera,
         )
-        self._recordings = {key: each for key, each in self._recordings.items() if each[0].holds}
-        if shape in self._recordings:
-            recording, step = self._recordings[shape]
-            step[0].camera = camera
-            commands.replay(recording)
-            return step
         if self._device.textures:  # copies to them depend on what was done before
             return self._record(commands, task, held)
-        recording = Recording(self._device)
-        with commands.taken_down(recording):
-            step = self._record(commands, task, held)
-        self._recordings[shape] = recording, step
-        return step
+        self._recordings = {key: each for key, each in self._recordings.items() if each.holds}
+        if shape in self._recordings:
+            recording = self._recordings[shape]
+            recording.result[0].camera = camera
+            recording.replay(commands)
+        else:
+            recording = self._recordings[shape] = Recording(commands, lambda: self._record(commands, task, held))
+        return recording.result
 
     def at(self, t: float, degree: int) -> Gaussians[DeviceArray]:
         """The Gaussians at a time of the field, in arrays that the next step overwrites. degree: of the harmonics."""
@@ -157,12 +149,10 @@ class ResidentPasses:
         self.rasterizer.backward(self.rasterizer.draw_whole(drawn, camera, gradient=True), d_image)
 
     def _record(self, commands: Commands, task: Task, truth: DeviceArray) -> Recorded:
-        guard, bad = self.word("guard"), self.word("bad")
-        totals = self._pool.array("totals", (len(TOTALS),))
-        for array in (bad, totals):
+        for array in (self._bad, self._totals):
             commands.clear(array)
-        decodings = self._decode(commands, task)
-        drawn = self._activate(commands, task.sh_degree, decodings[0])
+        decoding, line = self._decode(commands, task)
+        drawn = self._activate(commands, task.sh_degree, decoding)
         corrections, weights = self.corrections, self._weights(task)
         drawing = self.rasterizer.record(commands, drawn, task.view.camera, self._background, corrections.move)
         image = corrections.expose(commands, drawing.image)
@@ -170,12 +160,12 @@ class ResidentPasses:
         d_image = corrections.expose_bwd(commands, drawing.image, d_image)
         by_drawn = self.rasterizer.record_bwd(commands, drawing, d_image, camera=corrections.moves_camera)
         corrections.sum_camera(commands, by_drawn.camera)
-        self._record_bwd(commands, drawn, by_drawn, decodings, totals)
+        self._record_bwd(commands, drawn, by_drawn, decoding, line)
         self._record_end(commands, task, drawing, by_drawn, terms)
-        return drawing, [guard, bad, terms, totals, *drawing.needed]
+        return drawing, [self.guard, self._bad, terms, self._totals, *drawing.needed]
 
-    def _decode(self, commands: Commands, task: Task) -> Decodings:
-        """Record the field; what varies from step to step is asked for anew."""
+    def _decode(self, commands: Commands, task: Task) -> tuple[Decoding | None, Line | None]:
+        """Record the field at a step's time and around it, where the step has these; what varies is asked for anew."""
         field, values = self._field, self.parameters.arrays("value")
         if field is None or not task.scheduled.moving:
             return None, None
@@ -199,16 +189,15 @@ class ResidentPasses:
         commands: Commands,
         drawn: Gaussians[DeviceArray],
         by_drawn: GaussianGradients,
-        decodings: Decodings,
-        totals: DeviceArray,
+        decoding: Decoding | None,
+        line: Line | None,
     ) -> None:
         """Record the losses of motion, and the gradients of the parameters from those of what was drawn."""
         passes, field, smooth = self._activation, self._field, self._config.smoothness
-        decoding, line = decodings
         values, gradients = self.parameters.arrays("value"), self.parameters.arrays("gradient")
         if line is not None:
             accelerations = passes.acceleration(commands, line, values.geometry, drawn, by_drawn, gradients.geometry)
-            self._total(commands, accelerations, "acceleration", line.scale, totals)
+            self._total(commands, accelerations, "acceleration", line.scale)
         d_sh = self.parameters.blocks["sh"].arrays["gradient"]
         passes.activate_bwd(commands, values.geometry, drawn, by_drawn, decoding, gradients.geometry, d_sh)
         if field is None or decoding is None:
@@ -220,15 +209,15 @@ class ResidentPasses:
             near, times = self._of_task("near"), (decoding.time, self._of_task("near_time"))
             differences = field.compare(commands, values, gradients, near, times, weights)
             for total, sums, weight in zip(TOTALS, differences, weights, strict=False):
-                self._total(commands, sums, total, weight, totals)
+                self._total(commands, sums, total, weight)
         if self._dynamics_loss:
-            self._dynamics(commands, values.beside, gradients.beside, totals)
+            self._dynamics(commands, values.beside, gradients.beside)
 
-    def _total(self, commands: Commands, values: DeviceArray, name: str, factor: float, totals: DeviceArray) -> None:
+    def _total(self, commands: Commands, values: DeviceArray, name: str, factor: float) -> None:
         """Record the sum of values, times a factor, in the place of this name."""
-        sum_columns(commands, self._pool, values, totals, place=TOTALS.index(name), factor=factor)
+        sum_columns(commands, self._pool, values, self._totals, place=TOTALS.index(name), factor=factor)
 
-    def _dynamics(self, commands: Commands, rows: DeviceArray, d_rows: DeviceArray, totals: DeviceArray) -> None:
+    def _dynamics(self, commands: Commands, rows: DeviceArray, d_rows: DeviceArray) -> None:
         """Record the loss of the dynamics attributes and its gradient (motion/fields/dynamics)."""
         n, stride = rows.shape
         sums = ("distance_sums", "square_sums", "losses")
@@ -240,29 +229,29 @@ class ResidentPasses:
             kernel = Kernel.get(self._device, name, GROUPS=_DYNAMICS_GROUPS)
             arrays["dynamics"] = self._pool.constant(kernel.uniform("Dynamics", **sizes))
             commands.run(kernel, _DYNAMICS_GROUPS, arrays)
-        self._total(commands, arrays["losses"], "dynamics", 1.0, totals)
+        self._total(commands, arrays["losses"], "dynamics", 1.0)
 
     def _record_end(
         self, commands: Commands, task: Task, drawing: Drawing, by_drawn: GaussianGradients, terms: DeviceArray
     ) -> None:
         """Record whether the step may change anything, and what it changes."""
-        moving, count, guard, bad = task.scheduled.moving, len(self._scene), self.word("guard"), self.word("bad")
-        self.parameters.record_check(commands, bad, moving=moving)
-        self.corrections.record_check(commands, bad)
-        check_finite(commands, self._pool, terms, bad)
+        moving, count, guard = task.scheduled.moving, len(self._scene), self.guard
+        self.parameters.record_check(commands, self._bad, moving=moving)
+        self.corrections.record_check(commands, self._bad)
+        check_finite(commands, self._pool, terms, self._bad)
         close = Kernel.get(self._device, "close_guard")
         given = {"capacity": drawing.plan.capacity, "rounds": int(bool(self.rasterizer.config.round_splats))}
         guarded = self._pool.varying(
             "guarded", lambda: close.uniform("Guarded", step=self._task.scheduled.step, **given)
         )
         for needed in drawing.needed:
-            commands.dispatch(close, 1, guarded=guarded, needed=needed, bad=bad, guard=guard)
+            commands.dispatch(close, 1, guarded=guarded, needed=needed, bad=self._bad, guard=guard)
         if task.scheduled.seen:
             kernel, camera = Kernel.get(self._device, "accumulate_statistics"), task.view.camera
             content = kernel.uniform("Seen", half_size=(camera.width / 2, camera.height / 2), gaussians=count)
             arrays = {"splats": drawing.splats, "d_splats": by_drawn.splats, "statistics": self.seen()}
             seen = self._pool.constant(content)
             commands.dispatch(kernel, -(-count // 64), seen=seen, guard=guard, **arrays)
-        self.parameters.record_adam(commands, guard, lambda: self._task.rates, moving=moving)
+        self.parameters.record_adam(commands, guard, moving=moving)
         geometry = self.parameters.blocks["geometry"].arrays["value"]
         self.corrections.record_step(commands, guard, drawing.frames[0], geometry)

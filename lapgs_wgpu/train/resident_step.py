@@ -16,8 +16,7 @@ from torch import Tensor
 
 from lapgs_wgpu.errors import NumericalError
 from lapgs_wgpu.gpu.array import read_all
-from lapgs_wgpu.gpu.kernel import Commands
-from lapgs_wgpu.gpu.later import Later
+from lapgs_wgpu.gpu.kernel import Commands, Later
 from lapgs_wgpu.motion.passes.samples import Samples
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.train.density_control import DensityControl
@@ -36,8 +35,8 @@ _OVERFLOW = 1 << 31  # close_guard.wgsl
 class ResidentStep:
     """Takes the steps of a training whose parameters stay on the device.
 
-    settled: the last step that was waited for. broken: called with it where an error ends the steps behind it, and with
-    None where the parameters themselves are not finite. tell: called with what each step tells, in their order.
+    broken: called with the last step that was waited for where an error ends those behind it, and with None where the
+    parameters themselves are not finite. tell: called with what each step tells, in their order.
     """
 
     def __init__(
@@ -54,8 +53,6 @@ class ResidentStep:
         self.parameters = self._passes.parameters
         self._flying: deque[Task] = deque()
         self._ring: list[Any] = []
-        self._statistics_on_host = True
-        self.settled = 0
         scene.on_access, scene.on_device = self.to_host, self.at
         learners.optimizer.on_access = partial(self.to_host, state=True)
         learners.on_access = self.corrections_to_host
@@ -66,12 +63,11 @@ class ResidentStep:
         """Wait for all steps, and make the scene's tensors of some parts, of all if none is named, the newest ones.
         state: the optimizers' state of them, too."""
         self.settle()
-        self.parameters.pull(*parts, state=state)
-        if "gaussians" in (parts or PARTS) and not self._statistics_on_host:
-            self._statistics_on_host = True
+        if "gaussians" in set(parts or PARTS) - self.parameters.values_on_host:
             seen = torch.from_numpy(self._passes.seen().read())
             for target, column in zip(vars(self._density.statistics).values(), seen.T, strict=True):
                 target.copy_(column)
+        self.parameters.pull(*parts, state=state)
 
     def corrections_to_host(self) -> None:
         """Wait for all steps, and make the host's corrections of cameras and colors the newest ones."""
@@ -84,7 +80,7 @@ class ResidentStep:
         self.parameters.push_values()
         now = self._passes.at(t, self._scene.sh_degree)
         tensors = [torch.from_numpy(array) for array in read_all(list(now.arrays().values()))]
-        return Gaussians(**dict(zip(now.arrays(), tensors, strict=True)), antialiased=now.antialiased)
+        return Gaussians(*tensors, antialiased=now.antialiased)
 
     def settle(self) -> None:
         """Wait for all steps."""
@@ -100,8 +96,6 @@ class ResidentStep:
         """Submit a step, after `make_room`; gives what it will have told, for which that waits. began: called when it
         is submitted."""
         task = self._task(scheduled)
-        if not self._flying:
-            self.settled = scheduled.step - 1
         self._flying.append(self._submit(task))
         began()
 
@@ -132,12 +126,11 @@ class ResidentStep:
         return task
 
     def _submit(self, task: Task) -> Task:
+        if "gaussians" in self.parameters.values_on_host:
+            seen = torch.stack([*vars(self._density.statistics).values()], dim=1)
+            self._passes.seen().write(seen.numpy(force=True))
         self.parameters.push()
         self._passes.corrections.push()
-        if self._statistics_on_host:
-            self._statistics_on_host = False
-            columns = [values.numpy(force=True) for values in vars(self._density.statistics).values()]
-            self._passes.seen().write(np.stack(columns, axis=1).astype(np.float32))
         truth = self._draws.truth.on_device(task.view)
         self._passes.check_driver(task)
         task.counts = dict(self.parameters.steps)
@@ -152,21 +145,23 @@ class ResidentStep:
     def _settle_first(self) -> None:
         """Wait for the step that was submitted first, and mend what it asks for.
 
-        After an error the parameters are those after the step `settled`, which `broken` is called with.
+        After an error the parameters are those after the step which `broken` is called with.
         """
         tasks = list(self._flying)
         try:
             self._settle()
-        except Exception:
+        except Exception as error:
             self._flying.clear()
-            for task in [task for task in tasks if task.scheduled.step == self.settled + 1]:
+            undone = [task for task in tasks if task.measured is None]
+            for task in undone[:1]:
                 self._draws.go_back(task.before)
                 self._scene.sh_degree = task.sh_degree
-            self._broken(self.settled)
+            bad = isinstance(error, NumericalError) and len(undone) == len(tasks)  # else too many steps were skipped
+            self._broken(None if bad else tasks[-1].scheduled.step - len(undone))
             raise
 
     def _settle(self) -> None:
-        first, word = self._flying[0], self._passes.word
+        first = self._flying[0]
         guard, bad, values, totals, *needed = first.later.read()
         terms = self._passes.terms(first, values.tolist(), totals.tolist())
         told = Measured(sum(terms.values()), psnr_of(float(values[1])), terms=terms)
@@ -179,23 +174,19 @@ class ResidentStep:
         self._flying.clear()
         for each in behind[1:]:
             each.later.read()
-        word("guard").write(np.zeros(1, np.uint32))
+        self._passes.guard.write(np.zeros(1, np.uint32))
         self.parameters.steps = dict(first.counts)
         if bad[0] & _OVERFLOW:
             self._passes.rasterizer.grow_on_overflow(first.drawing, needed)
         else:
             self.to_host()
-            try:
-                check_parameters(self._learners.parameters())
-            except NumericalError:
-                self._broken(None)
-                raise
+            check_parameters(self._learners.parameters())
             skipped = Skipped(first.scheduled.step, first.view.name, cause(terms, {}))
             self._end(behind.pop(0), told._replace(skipped=skipped))
         self._flying.extend(self._submit(each) for each in behind)
 
     def _end(self, task: Task, told: Measured) -> None:
-        self.settled, task.measured = task.scheduled.step, told
+        task.measured = told
         self._tell(told)
 
 

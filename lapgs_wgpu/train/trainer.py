@@ -92,12 +92,7 @@ class Trainer:
         self.done = 0
         self.scene, self.discovery, self.discovery_seconds = start.scene, start.summary, start.seconds
         self.warm_up_steps, self._ramp_steps = start.warm_up_steps, start.ramp_steps
-        self._threads = step_threads(self.config.field, device)
         self._generator = torch.Generator().manual_seed(config.seed)
-        self._prepare(start)
-        self.whole = True
-
-    def _prepare(self, start: Start) -> None:
         config, scene, dataset = self.config, self.scene, self.dataset
         color = torch.full((3,), BACKGROUND_LEVELS[config.data.background])
         self._truth = GroundTruth(scene.device, color, int(config.data.cache_gb * 1e9))
@@ -116,6 +111,7 @@ class Trainer:
         self._plans, camera = rasterizer_of(scene.device).plans, dataset.train[0].camera
         self._drawn = (camera.width, camera.height, True)  # the kind of images that the steps draw
         self._plans.set_bands(self._drawn, 1)
+        self.whole = True
 
     @property
     def cameras(self) -> CameraRefinement | None:
@@ -186,7 +182,7 @@ class Trainer:
         control's state stay as they were; what the schedule plans for this step is done. Raises NumericalError where
         too many are skipped, or where a parameter is not finite, and DeviceError.
         """
-        with torch_threads(self._threads):
+        with torch_threads(step_threads(self.config.field, self.scene.device)):
             result = self._step()
         for callback in self.callbacks:
             callback(self, result)
@@ -245,10 +241,8 @@ class Trainer:
     @torch.no_grad()
     def _picture(self, view: View, timing: Timing) -> Tensor:
         """The scene's picture (H, W, 3) of a training view, with the corrections of its camera and of its colors."""
-        image = self.scene.render(
-            self._learners.camera(view), view.time, self._truth.color, depth=False, timing=timing
-        ).image
-        correction = self.exposure_of(view)
+        camera, correction = self._learners.camera(view), self.exposure_of(view)
+        image = self.scene.render(camera, view.time, self._truth.color, depth=False, timing=timing).image
         return image if correction is None else image @ correction[:, :3].T + correction[:, 3]
 
     # The state between two steps -------------------------------------------------------------------------------------
