@@ -5,7 +5,7 @@ import json
 import textwrap
 import typing
 
-from lapgs_wgpu.command import DEVICE_HELP, LIST_DEVICES_HELP, HelpFormatter, Parser
+from lapgs_wgpu.command import DEVICE_HELP, LIST_DEVICES_HELP, Parser
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.dataclass_table import did_you_mean
 from lapgs_wgpu.train.presets import ABLATIONS, config_keys, load_config, preset_names
@@ -49,14 +49,7 @@ def parse_options(arguments: list[str]) -> dict[str, typing.Any]:
     presets = preset_names()
     preset = next((word for word in arguments if word in presets), "dnerf")
     help_wanted = "-h" in arguments or "--help" in arguments
-    parser = Parser(
-        "lapgs-train",
-        usage=USAGE,
-        description=DESCRIPTION,
-        epilog=keys_help(preset) if help_wanted else None,
-        formatter_class=HelpFormatter,
-        allow_abbrev=False,
-    )
+    parser = Parser("lapgs-train", DESCRIPTION, usage=USAGE, epilog=keys_help(preset) if help_wanted else None)
     # fmt: off
     add = parser.add_argument
     parts = "; ".join(f"{name} ({text})" for name, (text, _, _) in ABLATIONS.items())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -23,11 +23,6 @@ if TYPE_CHECKING:
 
 _SIZE = (1280, 720)  # of a window or picture, where nothing else says it
 _WITHOUT_WINDOW = "take --backend http to look in a browser (also from another machine), or --screenshot FILE.png"
-
-
-def view_command(arguments: Sequence[str] | None = None) -> int:
-    """Run lapgs-view and return its exit code."""
-    return guarded("lapgs-view", _view, list(sys.argv[1:] if arguments is None else arguments))
 
 
 def _view(arguments: list[str]) -> None:
@@ -178,6 +173,8 @@ def _named(name: str, ending: str, option: str) -> Path:
         raise InputError(f"{option} {name}: expected a name that ends with {ending}.")
     return Path(name)
 
+
+view_command = partial(guarded, "lapgs-view", _view)
 
 if __name__ == "__main__":
     sys.exit(view_command())

@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import PurePath
 from typing import Any
 
-from lapgs_wgpu.command import DEVICE_HELP, LIST_DEVICES_HELP, HelpFormatter, Parser
+from lapgs_wgpu.command import DEVICE_HELP, LIST_DEVICES_HELP, Parser
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.viewer.clock import LOOPS
 from lapgs_wgpu.viewer.render_modes import AHEAD, BACKGROUNDS, MODES
@@ -81,7 +81,7 @@ def _option(name: str) -> str:
 
 
 def _parse(arguments: Sequence[str]) -> Any:
-    parser = Parser("lapgs-view", description=DESCRIPTION, formatter_class=HelpFormatter, allow_abbrev=False)
+    parser = Parser("lapgs-view", DESCRIPTION)
     # fmt: off
     add = parser.add_argument
     # All defaults are None, which tells given options from others.
