@@ -19,7 +19,7 @@ from lapgs_wgpu.io.folder_lock import locked_folder
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.progress import Progress, say
+from lapgs_wgpu.progress import say
 from lapgs_wgpu.stop_signals import stop_requests
 from lapgs_wgpu.train import run_folder
 from lapgs_wgpu.train.config import Config, DataConfig
@@ -156,12 +156,10 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
         measured: dict[str, Any] = {"steps": done, "seconds": round(log.seconds, 3)}
         if done == all_steps and (outside := _outside(scene)):
             log.tell(outside)
-        if training.cameras is not None:
-            measured["cameras"] = training.cameras.report()
-            log.tell(training.cameras.summary())
-        if training.timing is not None:
-            measured["image_times"] = training.timing.report()
-            log.tell(training.timing.summary())
+        for name, refinement in (("cameras", training.cameras), ("image_times", training.timing)):
+            if refinement is not None:
+                measured[name] = refinement.report()
+                log.tell(refinement.summary())
 
     return_freed_memory()
     run_folder.save_state(out, training.state())
@@ -185,7 +183,7 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
 def _after_step(out: Path, log: Log, training: Trainer, result: StepResult) -> None:
     """Log a step; at their intervals, log the mean PSNR of the validation views, or of some training views, and save
     the state."""
-    log.after_step(training, result)
+    log.step(result, len(training.scene))
     eval_interval, save_interval = training.config.eval.interval, training.config.schedule.save_interval
     if eval_interval and result.step % eval_interval == 0:
         start, data = time.perf_counter(), training.dataset
@@ -243,6 +241,5 @@ def evaluate_run(
     if folder.is_symlink():
         raise InputError(f"{folder} is a link, and images are written into the run's own folder only; remove it.")
     folder.mkdir(exist_ok=True)
-    with Progress(len(dataset.test), "test views measured") as progress:
-        metrics = evaluate(scene, dataset.test, data.background, folder, lpips=lpips, progress=progress)
+    metrics = evaluate(scene, dataset.test, data.background, folder, lpips=lpips)
     write_metrics(out, {**metrics, "training": training})

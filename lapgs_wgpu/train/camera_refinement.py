@@ -49,16 +49,14 @@ def image_motion(camera: Camera, points: ScenePoints, unit: float) -> Array:
     its center (along the world's axes, radians) and by a shift of it, in units of `unit` world units. Zeros where no
     point is in the image.
     """
-    R = camera.T_cam_world[:3, :3]
-    arm = points.positions - camera.position
+    R, arm = camera.T_cam_world[:3, :3], points.positions - camera.position
     x, y, z = (arm @ R.T).T
-    ahead = z > NEAREST * np.median(z[z > 0]) if (z > 0).any() else z > 0
-    x, y, z, arm, weights = x[ahead], y[ahead], z[ahead], arm[ahead], points.weights[ahead]
-    u, v = x / z, y / z
-    focal, center = camera.K[[0, 1], [0, 1]], camera.K[:2, 2]
-    across, down = focal[0] * u + center[0], focal[1] * v + center[1]
-    inside = (across >= 0) & (across < camera.width) & (down >= 0) & (down < camera.height)
-    u, v, z, arm, weights = u[inside], v[inside], z[inside], arm[inside], weights[inside]
+    pixels, _ = camera.project(points.positions)
+    seen = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1) & (z > 0)
+    if seen.any():
+        seen &= z > NEAREST * np.median(z[z > 0])
+    z, arm, weights = z[seen], arm[seen], points.weights[seen]
+    u, v = x[seen] / z, y[seen] / z
     # The rows of the projection's derivative by the point, along the world's axes.
     rows = np.stack([R[0] - u[:, None] * R[2], R[1] - v[:, None] * R[2]], axis=1) / z[:, None, None]
     J = np.concatenate([np.cross(rows, arm[:, None]), -unit * rows], axis=2)

@@ -9,7 +9,7 @@ import importlib.resources
 import json
 import os
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -102,9 +102,15 @@ def config_keys(cls: type = Config, prefix: str = "") -> dict[str, Any]:
     return keys
 
 
-def write_toml(table: Mapping[str, Any]) -> str:
-    """TOML text of nested dictionaries of texts, numbers, truth values and tuples."""
-    return "\n".join(_toml_lines(table, "")).strip() + "\n"
+def write_toml(table: Mapping[str, Any], prefix: str = "") -> str:
+    """TOML text of nested dictionaries of texts, numbers, truth values and tuples. prefix: of their names."""
+    values, tables = "", ""
+    for key, value in table.items():
+        if isinstance(value, Mapping):
+            tables += f"\n[{prefix}{key}]\n{write_toml(value, f'{prefix}{key}.')}"
+        else:  # what JSON writes is TOML, but for one character
+            values += f"{key} = {json.dumps(value, ensure_ascii=False)}\n".replace("\x7f", "\\u007f")
+    return values + tables
 
 
 def _read(preset: str, seen: tuple[str, ...] = ()) -> Table:
@@ -164,14 +170,3 @@ def _merge(below: Table, above: Table) -> Table:
         both = isinstance(value, dict) and isinstance(below.get(key), dict)
         merged[key] = _merge(below[key], value) if both else value
     return merged
-
-
-def _toml_lines(table: Mapping[str, Any], prefix: str) -> Iterator[str]:
-    inner = {key: value for key, value in table.items() if isinstance(value, Mapping)}
-    for key, value in table.items():
-        if key not in inner:  # what JSON writes is TOML, but for one character
-            text = json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-            yield f"{key} = {text}"
-    for key, value in inner.items():
-        yield from ("", f"[{prefix}{key}]")
-        yield from _toml_lines(value, f"{prefix}{key}.")
