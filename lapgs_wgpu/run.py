@@ -124,11 +124,9 @@ def resume(
 
 def _outside(scene: Scene4D) -> str:
     """A warning where the hash grids do not cover the canonical means of many Gaussians; else nothing."""
-    if not isinstance(scene.field, GridField):
-        return ""
     bound = scene.field_config.bound
     count = int((scene.parameters["means"].detach().abs() > bound).any(dim=1).sum())
-    if count < OUTSIDE * len(scene):
+    if not isinstance(scene.field, GridField) or count < OUTSIDE * len(scene):
         return ""
     return (
         f"warning: {count} of {len(scene)} Gaussians lie outside the field's box of half side {bound:g}, where it "

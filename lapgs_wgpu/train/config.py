@@ -152,10 +152,7 @@ class DensityConfig(Options):
 
 
 class LossWeights(NamedTuple):
-    """Of each term in the loss of an image; a term of weight 0 is not computed.
-
-    l1, ssim (of 1 - SSIM), pyramid and ncc multiply the terms as they are.
-    """
+    """Of the terms in the loss of an image (ssim: of 1 - SSIM); a term of weight 0 is not computed."""
 
     l1: float
     ssim: float

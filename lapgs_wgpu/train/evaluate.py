@@ -41,18 +41,12 @@ def evaluate(
     *,
     lpips: Lpips | None = None,
 ) -> dict[str, Any]:
-    """Render every view and compare: the content of metrics.json.
+    """Render every view and compare: the content of metrics.json (docs/metrics.md).
 
-    background: black or white. folder: where a picture of each view is written, the ground truth beside the rendering
-    and their error, 4 times enlarged, while the progress is shown; an existing folder. lpips: None where there are no
-    weights for it.
-
-    Each measure is one of an image, then the mean over the images (of PSNR of the dB): psnr over all channels; ssim,
-    that of the loss; ms_ssim; lpips on inputs in [-1, 1], and lpips_unscaled on inputs in [0, 1], as 3DGS's code
-    reports it. Where masks say what moves: psnr_moving and ssim_moving inside them, psnr_still and ssim_still outside,
-    explained the share of the moving pixels that are drawn as they are (`differing_pixels`); a picture off_NAME.png
-    shows such a view from OFF_PATH to the left and right. "not available" stands for what cannot be measured.
-    Raises InputError where there are no views, or a picture or a mask cannot be read.
+    background: black or white. folder: an existing one, where a picture of each view is written (`side_by_side`), and
+    off_NAME.png from OFF_PATH to the left and right of it where a mask says what moves; the progress is then shown.
+    lpips: None where there are no weights for it. Raises InputError where there are no views, or a picture or a mask
+    cannot be read.
     """
     if not views:
         raise InputError("there are no views to measure: most captures have no validation views, only test views.")

@@ -3,7 +3,6 @@
 In torch, differentiable, for any float dtype; all sums have a fixed order.
 """
 
-import functools
 import math
 
 import numpy as np
@@ -87,17 +86,11 @@ def _similarity(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
 
 def _blur(planes: Tensor) -> Tensor:
     """(P, H, W) planes under the Gaussian window, rows and columns in turn."""
-    window = _window(planes.dtype, planes.device)
+    x = torch.arange(SSIM_WINDOW, dtype=torch.float64) - SSIM_WINDOW // 2
+    weights = torch.exp(-x * x / (2 * SSIM_SIGMA**2))
+    window = (weights / weights.sum()).to(planes)
     count, margin = len(planes), SSIM_WINDOW // 2
     columns = window.view(1, 1, -1, 1).expand(count, 1, -1, 1)
     rows = window.view(1, 1, 1, -1).expand(count, 1, 1, -1)
     down = functional.conv2d(planes[None], columns, padding=(margin, 0), groups=count)
     return functional.conv2d(down, rows, padding=(0, margin), groups=count)[0]
-
-
-@functools.cache
-def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """(11,) the window along one axis; its sum is 1."""
-    x = torch.arange(SSIM_WINDOW, dtype=torch.float64) - SSIM_WINDOW // 2
-    weights = torch.exp(-x * x / (2 * SSIM_SIGMA**2))
-    return (weights / weights.sum()).to(dtype=dtype, device=device)

@@ -20,8 +20,6 @@ from lapgs_wgpu.motion.fields.config import Method
 from lapgs_wgpu.train.config import Config
 
 Table = dict[str, Any]
-ADVICE = '; add it, or start the file with base = "dnerf"'
-
 # The paper's parts beside its field: off for every other method.
 PAPER_ONLY = {"loss.pyramid": 0.0, "loss.ncc": 0.0, "density.split": "plain"}
 # The parts of the method that --ablate turns off: help text, key, and value of the key without the part.
@@ -35,8 +33,6 @@ ABLATIONS: dict[str, tuple[str, str, Any]] = {
     "hash": ("space-time hash grids", "field.temporal_hash", False),
     "appearance": ("color changes over time", "field.appearance", "none"),
 }
-
-_SCENES = "published-scenes"  # the file with presets of single scenes
 
 
 def preset_names() -> list[str]:
@@ -74,7 +70,7 @@ def load_config(
         for part in reversed(key.split(".")):
             value = {part: value}
         base = _merge(base, value)
-    return build_dataclass(Config, base, preset, advice=ADVICE)
+    return build_dataclass(Config, base, preset, advice='; add it, or start the file with base = "dnerf"')
 
 
 def _shorthands(method: str | None, ablate: Iterable[str]) -> dict[str, Any]:
@@ -148,7 +144,7 @@ def _packaged() -> dict[str, Table]:
     """The tables of configs/ by name. No caller changes them."""
     folder = Path(str(importlib.resources.files("lapgs_wgpu.configs")))
     presets = {file.stem: read_toml(file) for file in folder.glob("*.toml")}
-    return presets | presets.pop(_SCENES)
+    return presets | presets.pop("published-scenes")  # each table of which is a preset
 
 
 def _remove_unknown(table: Table, cls: type, prefix: str = "") -> list[str]:
@@ -163,10 +159,8 @@ def _remove_unknown(table: Table, cls: type, prefix: str = "") -> list[str]:
     return gone
 
 
-def _merge(below: Table, above: Table) -> Table:
-    """A nested table with another one laid over it."""
-    merged = dict(below)
-    for key, value in above.items():
-        both = isinstance(value, dict) and isinstance(below.get(key), dict)
-        merged[key] = _merge(below[key], value) if both else value
-    return merged
+def _merge(below: Any, above: Any) -> Any:
+    """A nested table with another one laid over it, of other values the one above."""
+    if not (isinstance(below, dict) and isinstance(above, dict)):
+        return above
+    return below | {key: _merge(below.get(key), value) for key, value in above.items()}
