@@ -100,8 +100,7 @@ def _evaluate(run: Path, options: Table, overrides: Table, lpips: Lpips | None) 
 
 
 def _check_alone(option: str, options: Table, keys: Collection[str], allowed: Collection[str] = ()) -> None:
-    """Raises InputError where --resume or --eval was given with another option that starts a training, or with keys of
-    the configuration."""
+    """Raises InputError where --resume or --eval was given with an option that starts a training, or with keys."""
     starting = ("preset", "field", "ablate", "out", "resume", "overwrite", "view")
     given = [name for name in starting if options[name] and name not in (option, *allowed)]
     if given := [*given, *sorted(keys)]:
@@ -123,10 +122,8 @@ def _config_of(run: Path, overrides: Table) -> Config:
 
 
 def _open_data(config: Config, parent: Path, run: Path | None = None) -> tuple[Config, Dataset]:
-    """The dataset, and the configuration with its folder.
-
-    parent: folder for the built-in scene. run: whose capture it must be. Raises InputError.
-    """
+    """The configuration with its data's folder, and the dataset. parent: folder for the built-in scene. run: whose
+    capture it must be. Raises InputError."""
     from lapgs_wgpu.train.run_folder import check_same_data
     from lapgs_wgpu.train.setup import open_dataset, resolve_data
 

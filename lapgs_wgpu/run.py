@@ -179,8 +179,7 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
 
 
 def _after_step(out: Path, log: Log, training: Trainer, result: StepResult) -> None:
-    """Log a step; at their intervals, log the mean PSNR of the validation views, or of some training views, and save
-    the state."""
+    """Log a step; at their intervals, the PSNR of validation views, or of some training views, and save the state."""
     log.step(result, len(training.scene))
     eval_interval, save_interval = training.config.eval.interval, training.config.schedule.save_interval
     if eval_interval and result.step % eval_interval == 0:

@@ -10,6 +10,7 @@ of the image motion, over points of the scene, says how much each change is seen
 gradient (CamP, Park et al. 2023).
 """
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -82,10 +83,8 @@ class CameraDescent:
         self._square, self._moves = torch.zeros(1, dtype=torch.float64), torch.zeros(1)
 
     def change(self, number: int, gradient: Array, whiten: Array, rate: float) -> Array:
-        """(6,) change of a camera: rotation, radians, and shift, in the units of `image_motion`.
-
-        gradient: (6,) of the loss. rate: of the image's motion, radians.
-        """
+        """(6,) change of a camera: rotation, radians, and shift, in the units of `image_motion`. gradient: (6,) of the
+        loss. rate: of the image's motion, radians."""
         white = whiten @ gradient
         self._moves += 1
         self._steps[number] += 1
@@ -207,14 +206,12 @@ class CameraRefinement:
 
 
 def changed_camera(camera: Camera, change: Array) -> Camera:
-    """A camera after a rotation about its center and a shift.
-
-    change: (6,) rotation vector along the world's axes, radians, and shift, world units.
-    """
+    """A camera after a change (6,): rotation vector about its center along the world's axes, radians; shift, world
+    units."""
     T = camera.T_cam_world.copy()
     T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec(change[:3]).as_matrix().T
     T[:3, 3] = -T[:3, :3] @ (camera.position + change[3:])
-    return Camera(camera.K, T, camera.width, camera.height, camera.near)
+    return dataclasses.replace(camera, T_cam_world=T)
 
 
 def _common_motions(cameras: Sequence[Camera], extent: float) -> Array:

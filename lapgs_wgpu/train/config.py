@@ -105,8 +105,7 @@ class RatesConfig(Options):
 
     def schedules(self) -> dict[str, Rate]:
         """Parameter name, or group of the field -> schedule."""
-        rates = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return {name: rate if isinstance(rate, Rate) else Rate(rate, rate, 1) for name, rate in rates.items()}
+        return {name: rate if isinstance(rate, Rate) else Rate(rate, rate, 1) for name, rate in vars(self).items()}
 
 
 @dataclass(frozen=True)

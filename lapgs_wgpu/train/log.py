@@ -57,8 +57,7 @@ class Log:
         return time.perf_counter() - self._start
 
     def step(self, result: StepResult, gaussians: int) -> None:
-        """Take in a step that is done, and the number of Gaussians after it; the loss of one that was skipped does not
-        count."""
+        """Take in a step that is done (the loss of a skipped one does not count), and the Gaussians after it."""
         step, last = result.step, result.step == self._steps
         self._fresh.append(result)
         self._times.append(time.perf_counter())

@@ -58,10 +58,7 @@ def set_up(
     if scene is not None:
         config = dataclasses.replace(config, field=scene.field_config)
     elif parts.field is not None:
-        try:
-            config = changed(config, {"field.kind": "own"})
-        except ValueError as error:
-            raise InputError(f"{error}.") from None
+        config = changed(config, {"field.kind": "own"})
     user_config = resolve_step(config, device, parts)
     resolved = resolve_for_dataset(user_config, dataset)
     if scene is not None:  # whose field does not change its shape any more
@@ -72,12 +69,11 @@ def set_up(
 def resolve_data(config: Config, scenes: Path) -> Config:
     """The configuration with the absolute paths of its data. scenes: folder into which the built-in scene is written,
     unless it is there. Raises InputError."""
-    path = config.data.path
+    path, masks = config.data.path, config.data.masks
     if not path:
         raise InputError(f"the configuration names no data; give --data DIR (in Python data.path), or {SYNTHETIC}.")
     folder = write_built_in(scenes / SYNTHETIC) if path == SYNTHETIC else Path(path)
-    masks = str(Path(config.data.masks).resolve()) if config.data.masks else ""
-    return changed(config, {"data.path": str(folder.resolve()), "data.masks": masks})
+    return changed(config, {"data.path": str(folder.resolve()), "data.masks": masks and str(Path(masks).resolve())})
 
 
 def open_dataset(config: Config) -> Dataset:
