@@ -91,8 +91,7 @@ def plan_training(
         layout = FILM
     for preset in PRESETS[layout][1:] if device.is_cpu else PRESETS[layout]:
         last = preset == PRESETS[layout][1]
-        own = {"exposure.enabled": True} if exposure else {}
-        config = load_config(preset, {"data.path": str(folder.resolve())} | own)
+        config = load_config(preset, {"data.path": str(folder.resolve()), "exposure.enabled": exposure})
         # No densification beyond twice the initial number, so that the measured step tells of the whole training.
         config = changed(config, {"density.limit": 2 * config.points.count})
         dataset = open_dataset(config)
