@@ -104,7 +104,10 @@ def keys_help(preset: str) -> str:
             value = getattr(value, part)
         entries = value if isinstance(value, tuple) else (value,)
         shown = " ".join(entry if isinstance(entry, str) else json.dumps(entry) for entry in entries)
-        option = f"{', '.join(_words(name))} {_metavar(kind)}"
+        kinds = typing.get_args(kind) or (kind,)
+        literal = typing.get_origin(kind) is typing.Literal
+        metavar = "|".join(kinds) if literal else " ".join(_METAVARS[each] for each in kinds)
+        option = f"{', '.join(_words(name))} {metavar}"
         text = ": ".join(filter(None, texts)) + (f" [{shown}]" if shown else "")
         first, others = f"  {option:<38}  ", " " * 42
         lines += textwrap.wrap(text, 120, initial_indent=first, subsequent_indent=others, break_on_hyphens=False)
@@ -114,10 +117,3 @@ def keys_help(preset: str) -> str:
 def _words(name: str) -> list[str]:
     """What a key is called on the command line."""
     return [*([SHORTCUTS[name]] if name in SHORTCUTS else []), f"--{name}"]
-
-
-def _metavar(kind: typing.Any) -> str:
-    parts = typing.get_args(kind)
-    if typing.get_origin(kind) is typing.Literal:
-        return "|".join(parts)
-    return " ".join(_METAVARS[part] for part in parts or (kind,))

@@ -16,7 +16,6 @@ TERMS = 5  # in the buffer that `record` leaves
 PYRAMID_BANDS = 3  # band-pass levels; below them lies the residual
 DIVISIBLE = 3  # pixels of a level's shorter side, which reflection needs
 NCC_WINDOW = 11
-_WHOLE = 1 << 14  # a lane takes a whole row or column, of a longer side several runs
 
 
 def pyramid_sizes(height: int, width: int) -> list[tuple[int, int]]:
@@ -47,8 +46,9 @@ class ImageLoss:
     def __init__(self, device: Device) -> None:
         self.device = device
         self.pool = BufferPool(device)
-        # On CPUs a workgroup is one vector that walks a whole row or column; GPUs need more lanes than that makes.
-        self._lanes, self._run = (8, _WHOLE) if device.is_cpu else (64, 64)
+        # On CPUs a workgroup is one vector that walks a whole row or column (in several runs, if it is longer than
+        # 16,384 pixels); GPUs need more lanes than that makes.
+        self._lanes, self._run = (8, 1 << 14) if device.is_cpu else (64, 64)
 
     def record(
         self, commands: Commands, image: DeviceArray, truth: DeviceArray, weights: LossWeights

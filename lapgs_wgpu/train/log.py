@@ -14,7 +14,6 @@ from lapgs_wgpu.progress import Progress, duration
 from lapgs_wgpu.train.step_result import StepResult
 
 INTERVAL = 50  # steps from one line of log.jsonl to the next, over which loss and PSNR are averaged
-_MOST_SECONDS = 1e9  # that a training takes
 
 
 class Log:
@@ -138,7 +137,7 @@ def _continued(path: Path, done: int) -> tuple[BinaryIO, float]:
                 line = json.loads(text)
                 if line["step"] <= done:
                     kept.append(text + "\n")
-                    seconds = min(max(float(line["timing"]["seconds"]), 0.0), _MOST_SECONDS)
+                    seconds = min(max(float(line["timing"]["seconds"]), 0.0), 1e9)
     with atomic_write(path) as file:
         file.write("".join(kept).encode())
     return path.open("ab", buffering=0), seconds  # a line is one write, and none waits for a later one to fail
