@@ -113,11 +113,9 @@ def _config_of(run: Path, overrides: Table) -> Config:
     if not (run / "config.toml").is_file():
         raise InputError(f"{run / 'config.toml'} does not exist; --resume and --eval need the folder of a run.")
     config = load_config(str(run / "config.toml"), overrides)
-    if config.data.path != "synthetic" and not Path(config.data.path).exists():
-        raise InputError(
-            f"{config.data.path}, the capture of {run / 'config.toml'}, does not exist; give --data the folder where "
-            "it is now."
-        )
+    path = config.data.path
+    if path != "synthetic" and not Path(path).exists():
+        raise InputError(f"{path}, the capture of {run / 'config.toml'}, does not exist; give --data where it is now.")
     return config
 
 

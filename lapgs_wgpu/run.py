@@ -104,10 +104,8 @@ def resume(
     with locked_folder(out):
         state = run_folder.load_state(out)
         if state is None and (out / "checkpoint.ply").exists():
-            raise InputError(
-                f"{out} holds a checkpoint, but no state to go on from ({run_folder.STATE}); copy that file, too, or "
-                "train anew."
-            )
+            missing = f"no state to go on from ({run_folder.STATE}); copy that file, too, or train anew"
+            raise InputError(f"{out} holds a checkpoint, but {missing}.")
         run_folder.note_paths(out, config)
         if state is None:
             training = start_training(config, dataset, device, parts=parts)
@@ -162,17 +160,16 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
     return_freed_memory()
     run_folder.save_state(out, training.state())
     training.save(out / "checkpoint.ply")
+    going_on = f"lapgs-train --resume {quoted(out)} goes on."
     if done < all_steps:
         raise KeyboardInterrupt(
-            f"stopped after step {done} of {all_steps}; {out / 'checkpoint.ply'} holds it, and "
-            f"lapgs-train --resume {quoted(out)} goes on."
+            f"stopped after step {done} of {all_steps}; {out / 'checkpoint.ply'} holds it, and {going_on}"
         )
     try:
         evaluate_run(out, scene, training.dataset, config.data, measured, lpips)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
-            "stopped after the last step, while the test views were measured; "
-            f"lapgs-train --resume {quoted(out)} goes on."
+            f"stopped after the last step, while the test views were measured; {going_on}"
         ) from None
     run_folder.drop_states(out)
     return scene
