@@ -11,6 +11,7 @@ import shutil
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -77,10 +78,8 @@ class Parser(argparse.ArgumentParser):
     """argparse, with its help and its mistakes told in our way."""
 
     def __init__(self, name: str, description: str, **more: Any) -> None:
-        def formatter(prog: str) -> argparse.HelpFormatter:
-            width = min(shutil.get_terminal_size((120, 24)).columns, 120)
-            return argparse.RawDescriptionHelpFormatter(prog, max_help_position=32, width=width)
-
+        width = min(shutil.get_terminal_size((120, 24)).columns, 120)
+        formatter = partial(argparse.RawDescriptionHelpFormatter, max_help_position=32, width=width)
         super().__init__(name, description=description, formatter_class=formatter, allow_abbrev=False, **more)
 
     def error(self, message: str) -> NoReturn:
