@@ -227,10 +227,8 @@ def evaluate_run(
     training: dict[str, Any],
     lpips: Lpips | None = None,
 ) -> None:
-    """Evaluate on the test views; write metrics.json and eval/ of a run folder.
-
-    data: says on which background. training: goes into metrics.json as it is. lpips: as for `evaluate`.
-    """
+    """Evaluate on the test views (`evaluate`); write metrics.json and eval/ of a run folder. data: says on which
+    background. training: goes into metrics.json as it is."""
     folder = out / "eval"
     if folder.is_symlink():
         raise InputError(f"{folder} is a link, and images are written into the run's own folder only; remove it.")

@@ -54,10 +54,8 @@ _JOBS = ("list_devices", "screenshot", "video", "export")
 
 
 def parse_options(arguments: Sequence[str]) -> tuple[Any, str]:
-    """Parse the command line: the options, None where not given, and the job: one of _JOBS, or window.
-
-    Raises InputError where options do not go together; none is silently ignored.
-    """
+    """Parse the command line: the options, None where not given, and the job: one of _JOBS, or window. Raises
+    InputError where options do not go together; none is silently ignored."""
     given = _parse(arguments)
     jobs = [name for name in _JOBS if getattr(given, name) is not None]
     if len(jobs) > 1:

@@ -87,9 +87,7 @@ def open_dataset(config: Config) -> Dataset:
 
 def resolve_for_dataset(config: Config, dataset: Dataset) -> Config:
     """The configuration with lengths in world units, and no more frequencies than the training times can tell apart.
-
-    Raises InputError where the data do not allow it.
-    """
+    Raises InputError where these are too many to be refined."""
     if config.timing.refine and len(dataset.times) > MOST_TIMES:
         raise InputError(
             f"{dataset.name} has {len(dataset.times)} times, and timing.refine takes {MOST_TIMES} at most; give "
@@ -153,10 +151,8 @@ class Start:
 
 
 def start_from_points(config: Config, dataset: Dataset, device: Device, own_field: nn.Module | None = None) -> Start:
-    """Start from initial points, and without motion in the first `schedule.warm_up` steps.
-
-    config: resolved for the dataset. Raises InputError where its field is `own`, and there is no module.
-    """
+    """Start from initial points, and without motion in the first `schedule.warm_up` steps. config: resolved for the
+    dataset. Raises InputError where its field is `own`, and there is no module."""
     scene = Scene4D.from_points(
         *initial_points(config.points, dataset, config.seed),
         config.field,
