@@ -219,10 +219,9 @@ def _common_motions(cameras: Sequence[Camera], extent: float) -> Array:
     arms = np.stack([camera.position for camera in cameras])
     arms = (arms - arms.mean(axis=0)) / extent
     zero = np.zeros_like(arms)
-    columns = [np.concatenate([zero, arms], axis=1)]
+    columns = [np.hstack([zero, arms])]
     for axis in np.eye(3):
-        columns.append(np.concatenate([zero, np.broadcast_to(axis, arms.shape)], axis=1))
-        columns.append(np.concatenate([np.broadcast_to(axis, arms.shape), np.cross(axis, arms)], axis=1))
+        columns += [np.hstack([zero, zero + axis]), np.hstack([zero + axis, np.cross(axis, arms)])]
     basis, sizes, _ = np.linalg.svd(np.stack([column.ravel() for column in columns], axis=1), full_matrices=False)
     return np.ascontiguousarray(basis[:, sizes > 1e-9 * sizes[0]])
 
