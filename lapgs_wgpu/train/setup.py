@@ -126,9 +126,7 @@ def why_exchange(config: Config, parts: Parts) -> str:
     """What of a training only torch can compute; "" where there is nothing."""
     if config.field.kind != "static" and not config.field.decodes_on_device:
         return f"there are no kernels for the field {config.field.kind} in this shape"
-    if parts.losses:
-        return "losses of one's own are torch's"
-    return ""
+    return "losses of one's own are torch's" if parts.losses else ""
 
 
 @dataclass(frozen=True)
