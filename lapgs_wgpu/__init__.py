@@ -27,29 +27,23 @@ if TYPE_CHECKING:
 # training step there is three to ten times slower. It has no effect where torch was imported before.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-_HOMES = {
-    "rasterize": "splat.rasterize",
-    "rasterization": "splat.rasterization",
-    "Rendering": "splat.rasterize",
-    "Camera": "splat.camera",
-    "Gaussians": "splat.gaussians",
-    "Scene4D": "motion.scene",
-    "load": "motion.scene",
-    "list_devices": "gpu.device",
-    "open_device": "gpu.device",
-    "load_config": "train.presets",
-    "load_dataset": "data.load",
-    "start_training": "discovery.discover",
-    "Trainer": "train.trainer",
-    "StepResult": "train.step_result",
-    "Parts": "train.parts",
-    "Deformation": "motion.fields.deformation",
-    "Regularizer": "train.parts",
-    "TorchLoss": "train.parts",
-    "DensityState": "train.densify",
-    "Change": "train.densify",
-    "published_rule": "train.densify",
+_NAMES = {
+    "data.load": ["load_dataset"],
+    "discovery.discover": ["start_training"],
+    "gpu.device": ["list_devices", "open_device"],
+    "motion.fields.deformation": ["Deformation"],
+    "motion.scene": ["Scene4D", "load"],
+    "splat.camera": ["Camera"],
+    "splat.gaussians": ["Gaussians"],
+    "splat.rasterization": ["rasterization"],
+    "splat.rasterize": ["Rendering", "rasterize"],
+    "train.densify": ["Change", "DensityState", "published_rule"],
+    "train.parts": ["Parts", "Regularizer", "TorchLoss"],
+    "train.presets": ["load_config"],
+    "train.step_result": ["StepResult"],
+    "train.trainer": ["Trainer"],
 }
+_HOMES = {name: home for home, names in _NAMES.items() for name in names}
 __all__ = [
     "Camera", "Change", "Deformation", "DensityState", "Gaussians", "Parts", "Regularizer", "Rendering", "Scene4D",
     "StepResult", "TorchLoss", "Trainer", "list_devices", "load", "load_config", "load_dataset",

@@ -6,8 +6,9 @@ import dataclasses
 import re
 import sys
 import typing
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 from lapgs_wgpu.command import guarded, print_devices
@@ -18,7 +19,6 @@ from lapgs_wgpu.train_options import parse_options
 
 if typing.TYPE_CHECKING:
     from lapgs_wgpu.data import Dataset
-    from lapgs_wgpu.run import Watch
     from lapgs_wgpu.train.config import Config
     from lapgs_wgpu.train.lpips import Lpips
 
@@ -27,62 +27,49 @@ EVAL_KEYS = ("data.path", "data.movers", "data.background", "data.cache_gb")  # 
 RESUME_KEYS = ("data.path", "data.masks", "data.cache_gb")  # and with --resume: where the capture is now
 
 
-def train_command(arguments: Sequence[str] | None = None) -> int:
-    """lapgs-train: returns the exit code."""
-    return guarded("lapgs-train", _train, list(sys.argv[1:] if arguments is None else arguments))
-
-
 def _train(arguments: list[str]) -> None:
     if "--list-devices" in arguments:
         print_devices()
         return
     options = parse_options(arguments)
-    from lapgs_wgpu.gpu.device import open_device  # what follows needs torch, which takes seconds to import
-    from lapgs_wgpu.run import train
+    from lapgs_wgpu import run  # what follows needs torch, which takes seconds to import
+    from lapgs_wgpu.gpu.device import open_device
     from lapgs_wgpu.train.lpips import Lpips
-    from lapgs_wgpu.train.run_folder import check_run_folder, result_text
+    from lapgs_wgpu.train.run_folder import changes_since, check_run_folder, result_text
 
     overrides = {key: options[key] for key in config_keys() if key in options}
     lpips = Lpips(Path(options["lpips_weights"])) if options["lpips_weights"] else None
-    if options["eval"]:
-        _evaluate(Path(options["eval"]), options, overrides, lpips)
-        return
     watch = None
-    if options["view"]:
+    if options["view"] and not options["eval"]:
         from lapgs_wgpu.viewer import live
 
         live.window.check_window("leave out --view")  # before anything is written or replaced
         watch = live.watch
-    if options["resume"]:
-        _resume(Path(options["resume"]), options, overrides, watch, lpips)
-        return
-    if options["preset"] is None:
+    if options["eval"]:
+        out = Path(options["eval"])
+        _evaluate(out, options, overrides, lpips)
+    elif options["resume"]:
+        out = Path(options["resume"])
+        _check_alone("resume", options, overrides.keys() - RESUME_KEYS, allowed=("view",))
+        config = _config_of(out, overrides)
+        device = open_device(options["device"])
+        config, dataset = _open_data(config, out.parent, out if "data.path" in overrides else None)
+        for what, before, now in changes_since(out, config, device, dataset):
+            print(f"lapgs-train: {what} was {before} when {out} began and is {now}: bits may differ.", file=sys.stderr)
+        run.resume(config, dataset, out, device=device, watch=watch, lpips=lpips)
+    elif options["preset"] is None:
         raise InputError("name a preset, such as tiny, and the data to train on; lapgs-train --help says more.")
-    ablate = [part.strip() for part in (options["ablate"] or "").split(",") if part.strip()]
-    config = load_config(options["preset"], overrides, method=options["field"], ablate=ablate)
-    scene = Path(config.data.path).resolve().name or "scene"
-    out = Path(options["out"] or f"runs/{scene}-{Path(options['preset']).stem}")
-    overwrite = options["overwrite"]
-    check_run_folder(out, overwrite=overwrite)
-    device = open_device(options["device"])
-    config, dataset = _open_data(config, out.parent)
-    train(config, dataset, out, device=device, overwrite=overwrite, watch=watch, lpips=lpips)
+    else:
+        ablate = [part.strip() for part in (options["ablate"] or "").split(",") if part.strip()]
+        config = load_config(options["preset"], overrides, method=options["field"], ablate=ablate)
+        scene = Path(config.data.path).resolve().name or "scene"
+        out = Path(options["out"] or f"runs/{scene}-{Path(options['preset']).stem}")
+        overwrite = options["overwrite"]
+        check_run_folder(out, overwrite=overwrite)
+        device = open_device(options["device"])
+        config, dataset = _open_data(config, out.parent)
+        run.train(config, dataset, out, device=device, overwrite=overwrite, watch=watch, lpips=lpips)
     say(result_text(out))
-
-
-def _resume(run: Path, options: Table, overrides: Table, watch: Watch | None, lpips: Lpips | None) -> None:
-    from lapgs_wgpu.gpu.device import open_device
-    from lapgs_wgpu.run import resume
-    from lapgs_wgpu.train.run_folder import changes_since, result_text
-
-    _check_alone("resume", options, overrides.keys() - RESUME_KEYS, allowed=("view",))
-    config = _config_of(run, overrides)
-    device = open_device(options["device"])
-    config, dataset = _open_data(config, run.parent, run if "data.path" in overrides else None)
-    for what, before, now in changes_since(run, config, device, dataset):
-        print(f"lapgs-train: {what} was {before} when {run} began and is {now}: bits may differ.", file=sys.stderr)
-    resume(config, dataset, run, device=device, watch=watch, lpips=lpips)
-    say(result_text(run))
 
 
 def _evaluate(run: Path, options: Table, overrides: Table, lpips: Lpips | None) -> None:
@@ -91,7 +78,6 @@ def _evaluate(run: Path, options: Table, overrides: Table, lpips: Lpips | None) 
     from lapgs_wgpu.io.safe_json_toml import read_json
     from lapgs_wgpu.motion.scene import load
     from lapgs_wgpu.run import evaluate_run
-    from lapgs_wgpu.train.run_folder import result_text
 
     _check_alone("eval", options, overrides.keys() - EVAL_KEYS)
     movers = overrides.pop("data.movers", None)
@@ -111,16 +97,14 @@ def _evaluate(run: Path, options: Table, overrides: Table, lpips: Lpips | None) 
     with suppress(ValueError, KeyError, TypeError):  # InputError is a ValueError
         training |= read_json(run / "metrics.json")["training"]
     evaluate_run(run, scene, dataset, config.data, training, lpips)
-    say(result_text(run))
 
 
 def _check_alone(option: str, options: Table, keys: Collection[str], allowed: Collection[str] = ()) -> None:
-    """Raises InputError where --resume or --eval was given with another option that starts a training, or with keys of
-    the configuration."""
+    """Raises InputError where --resume or --eval was given with an option that starts a training, or with keys."""
     starting = ("preset", "field", "ablate", "out", "resume", "overwrite", "view")
-    words = [f"--{name}" for name in starting if options[name] and name not in (option, *allowed)]
-    for word in [*words, *(f"--{key}" for key in sorted(keys))]:
-        word = repr(options["preset"]) if word == "--preset" else word
+    given = [name for name in starting if options[name] and name not in (option, *allowed)]
+    if given := [*given, *sorted(keys)]:
+        word = repr(options["preset"]) if given[0] == "preset" else f"--{given[0]}"
         raise InputError(f"--{option} takes the configuration of the run as it is, so {word} cannot be given.")
 
 
@@ -129,19 +113,15 @@ def _config_of(run: Path, overrides: Table) -> Config:
     if not (run / "config.toml").is_file():
         raise InputError(f"{run / 'config.toml'} does not exist; --resume and --eval need the folder of a run.")
     config = load_config(str(run / "config.toml"), overrides)
-    if config.data.path != "synthetic" and not Path(config.data.path).exists():
-        raise InputError(
-            f"{config.data.path}, the capture of {run / 'config.toml'}, does not exist; give --data the folder where "
-            "it is now."
-        )
+    path = config.data.path
+    if path != "synthetic" and not Path(path).exists():
+        raise InputError(f"{path}, the capture of {run / 'config.toml'}, does not exist; give --data where it is now.")
     return config
 
 
 def _open_data(config: Config, parent: Path, run: Path | None = None) -> tuple[Config, Dataset]:
-    """The dataset, and the configuration with its folder.
-
-    parent: folder for the built-in scene. run: whose capture it must be. Raises InputError.
-    """
+    """The configuration with its data's folder, and the dataset. parent: folder for the built-in scene. run: whose
+    capture it must be. Raises InputError."""
     from lapgs_wgpu.train.run_folder import check_same_data
     from lapgs_wgpu.train.setup import open_dataset, resolve_data
 
@@ -151,6 +131,8 @@ def _open_data(config: Config, parent: Path, run: Path | None = None) -> tuple[C
         check_same_data(run, config.data.path, dataset)
     return config, dataset
 
+
+train_command = partial(guarded, "lapgs-train", _train)
 
 if __name__ == "__main__":
     sys.exit(train_command())

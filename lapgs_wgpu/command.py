@@ -9,10 +9,11 @@ import io
 import os
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from lapgs_wgpu.errors import DeviceError, InputError, NoAdapterError, NumericalError, quoted
 from lapgs_wgpu.gpu.device import list_devices
@@ -24,14 +25,15 @@ DEVICE_HELP = (
 LIST_DEVICES_HELP = "list the graphics adapters and exit; the first one is the default unless LAPGS_DEVICE is set"
 
 
-def guarded(name: str, command: Callable[[list[str]], int | None], arguments: list[str]) -> int:
-    """Run a command; what its user should know goes to stderr in one sentence. Returns the exit code."""
+def guarded(name: str, command: Callable[[list[str]], int | None], arguments: Sequence[str] | None = None) -> int:
+    """Run a command, with the arguments of this process where None; what its user should know goes to stderr in one
+    sentence. Returns the exit code."""
     if isinstance(sys.stdout, io.TextIOWrapper):  # letters that its encoding lacks are escaped, as on stderr
         utf8 = sys.platform == "win32" and not sys.stdout.isatty()
         sys.stdout.reconfigure(encoding="utf-8" if utf8 else None, errors="backslashreplace")
     text = ""
     try:
-        code = command(arguments) or 0
+        code = command(list(sys.argv[1:] if arguments is None else arguments)) or 0
     except NoAdapterError as error:  # either no adapter at all, or none of the wanted name
         text, code = str(error), 2 if list_devices() else 3
     except InputError as error:
@@ -72,13 +74,13 @@ def print_devices() -> None:
         print(f"{info.name}  ({info.kind}, {info.backend}, {info.driver})")
 
 
-class HelpFormatter(argparse.RawDescriptionHelpFormatter):
-    def __init__(self, prog: str) -> None:
-        super().__init__(prog, max_help_position=32, width=min(shutil.get_terminal_size((120, 24)).columns, 120))
-
-
 class Parser(argparse.ArgumentParser):
-    """argparse, with its mistakes told in our way."""
+    """argparse, with its help and its mistakes told in our way."""
+
+    def __init__(self, name: str, description: str, **more: Any) -> None:
+        width = min(shutil.get_terminal_size((120, 24)).columns, 120)
+        formatter = partial(argparse.RawDescriptionHelpFormatter, max_help_position=32, width=width)
+        super().__init__(name, description=description, formatter_class=formatter, allow_abbrev=False, **more)
 
     def error(self, message: str) -> NoReturn:
         raise InputError(f"{message}; {self.prog} --help lists the options.")

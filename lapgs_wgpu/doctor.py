@@ -56,27 +56,24 @@ def known_image(gaussians: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
     """Colors (H, W, 3) and depths (H, W) of stacked Gaussians, differentiable: only a correct sort gives the same."""
     depths, alphas = gaussians["means"][:, 2], pixel_alphas(gaussians)
     alphas = torch.where(alphas >= CONSTANTS["ALPHA_MIN"], alphas, 0.0)
-    image, depth = torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.float64), torch.zeros(HEIGHT, WIDTH, dtype=torch.float64)
-    transmittance = torch.ones(HEIGHT, WIDTH, dtype=torch.float64)
-    for i in depths.argsort():
-        weight = transmittance * alphas[i]
-        image, depth = image + weight[..., None] * gaussians["colors"][i], depth + weight * depths[i]
-        transmittance = transmittance - weight
-    return image + transmittance[..., None] * BACKGROUND, depth
+    order = depths.argsort()
+    behind = torch.cumprod(1 - alphas[order], dim=0)  # what each and those before it let through
+    weights = alphas[order] * torch.cat([torch.ones_like(behind[:1]), behind[:-1]])
+    image = torch.einsum("nhw,nc->hwc", weights, gaussians["colors"][order]) + behind[-1, ..., None] * BACKGROUND
+    return image, torch.einsum("nhw,n->hw", weights, depths[order])
 
 
 def errors(device: Device) -> Iterator[float]:
     """The largest errors of an adapter, in the order of ALLOWED, each as it has been computed."""
     exact = stacked_gaussians()
-    tensors = {name: value.detach().float().requires_grad_() for name, value in exact.items()}
-    gaussians: dict[str, Any] = dict(tensors)  # arguments of rasterize by name
+    gaussians: dict[str, Any] = {name: value.detach().float().requires_grad_() for name, value in exact.items()}
     K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
     camera = Camera(K, np.eye(4), WIDTH, HEIGHT)
     rendering = rasterize(**gaussians, camera=camera, background=BACKGROUND.float(), device=device)
     image, depth = known_image(exact)
     yield max(relative_error(rendering.image, image), relative_error(rendering.depth, depth))
     weights = torch.randn(HEIGHT, WIDTH, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    computed = torch.autograd.grad((rendering.image * weights.float()).sum(), list(tensors.values()))
+    computed = torch.autograd.grad((rendering.image * weights.float()).sum(), list(gaussians.values()))
     expected = torch.autograd.grad((image * weights).sum(), list(exact.values()))
     yield max(map(relative_error, computed, expected))
 

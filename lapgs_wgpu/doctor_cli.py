@@ -6,10 +6,10 @@ The report is public: it names no users, hosts or folders.
 import os
 import platform
 import sys
-from collections.abc import Sequence
+from functools import partial
 from importlib import metadata
 
-from lapgs_wgpu.command import DEVICE_HELP, HelpFormatter, Parser, guarded
+from lapgs_wgpu.command import DEVICE_HELP, Parser, guarded
 from lapgs_wgpu.gpu.device import adapter_details
 
 DESCRIPTION = """\
@@ -30,14 +30,9 @@ VARIABLES = (
 )  # fmt: skip
 
 
-def doctor_command(arguments: Sequence[str] | None = None) -> int:
-    """lapgs-doctor: returns the exit code."""
-    return guarded("lapgs-doctor", _doctor, list(sys.argv[1:] if arguments is None else arguments))
-
-
 def options() -> Parser:
     """The parser of the command line."""
-    parser = Parser("lapgs-doctor", description=DESCRIPTION, formatter_class=HelpFormatter, allow_abbrev=False)
+    parser = Parser("lapgs-doctor", DESCRIPTION)
     parser.add_argument("--device", metavar="NAME", help=DEVICE_HELP)
     return parser
 
@@ -88,6 +83,8 @@ def _file_names(paths: str) -> str:
     """A list of paths without their folders."""
     return os.pathsep.join(path.replace("\\", "/").rsplit("/", 1)[-1] for path in paths.split(os.pathsep))
 
+
+doctor_command = partial(guarded, "lapgs-doctor", _doctor)
 
 if __name__ == "__main__":
     sys.exit(doctor_command())

@@ -19,9 +19,7 @@ class InputError(ValueError):
     def __init__(self, text: str) -> None:
         if len(text) > _MOST:
             text = f"{text[: _MOST // 2]}...{text[-_MOST // 2 :]}"
-        if not text.isprintable():
-            text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
-        super().__init__(text)
+        super().__init__("".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text))
 
 
 class NoAdapterError(RuntimeError):

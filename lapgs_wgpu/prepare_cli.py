@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from lapgs_wgpu.command import HelpFormatter, Parser, beside, guarded
+from lapgs_wgpu.command import Parser, beside, guarded
 from lapgs_wgpu.errors import InputError, quoted
 from lapgs_wgpu.io.listing import listed
 
@@ -33,13 +33,8 @@ programs, but the extra prepare: pip install "lapgs-wgpu[prepare]".
 DIR/report.html shows what was found. See docs/own-data.md."""
 
 
-def prepare_command(arguments: Sequence[str] | None = None) -> int:
-    """lapgs-prepare: returns the exit code."""
-    return guarded("lapgs-prepare", _prepare, list(sys.argv[1:] if arguments is None else arguments))
-
-
 def options() -> Parser:
-    parser = Parser("lapgs-prepare", description=DESCRIPTION, formatter_class=HelpFormatter, allow_abbrev=False)
+    parser = Parser("lapgs-prepare", DESCRIPTION)
     # fmt: off
     add = parser.add_argument
     add("films", nargs="*", type=Path, metavar="FILM", help="films, one per camera; or images, folders, patterns, zip "
@@ -152,6 +147,8 @@ def _train_anew(capture: Path, minutes: float | None) -> NoReturn:
     sys.stdout.flush()
     os.execv(sys.executable, command)
 
+
+prepare_command = partial(guarded, "lapgs-prepare", _prepare)
 
 if __name__ == "__main__":
     sys.exit(prepare_command())

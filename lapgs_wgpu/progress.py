@@ -37,10 +37,12 @@ class Progress:
         the first call."""
         self._done = done
         now = time.perf_counter()
-        self._first = self._first or (done, now)
+        self._first = first, since = self._first or (done, now)
         if done == self._total or self.due:
             self._shown = now
-            line = text() if text else self._line(now)
+            line = text() if text else f"{done}/{self._total} {self._what}"
+            if not text and done != first:
+                line += f"  {duration((now - since) / (done - first) * (self._total - done))} left"
             self._write(in_place(line) if self._stream.isatty() else f"{line}\n")
 
     @property
@@ -58,13 +60,6 @@ class Progress:
         """Remove the line from a terminal."""
         if self._stream.isatty():
             self._write(in_place("") + "\r")
-
-    def _line(self, now: float) -> str:
-        first, since = self._first or (self._done, now)
-        line = f"{self._done}/{self._total} {self._what}"
-        if self._done == first:
-            return line
-        return f"{line}  {duration((now - since) / (self._done - first) * (self._total - self._done))} left"
 
     def _write(self, text: str) -> None:
         with suppress(OSError):  # a closed pipe or a full disk behind stderr does not stop the job

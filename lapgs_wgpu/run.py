@@ -19,7 +19,7 @@ from lapgs_wgpu.io.folder_lock import locked_folder
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.progress import Progress, say
+from lapgs_wgpu.progress import say
 from lapgs_wgpu.stop_signals import stop_requests
 from lapgs_wgpu.train import run_folder
 from lapgs_wgpu.train.config import Config, DataConfig
@@ -104,10 +104,8 @@ def resume(
     with locked_folder(out):
         state = run_folder.load_state(out)
         if state is None and (out / "checkpoint.ply").exists():
-            raise InputError(
-                f"{out} holds a checkpoint, but no state to go on from ({run_folder.STATE}); copy that file, too, or "
-                "train anew."
-            )
+            missing = f"no state to go on from ({run_folder.STATE}); copy that file, too, or train anew"
+            raise InputError(f"{out} holds a checkpoint, but {missing}.")
         run_folder.note_paths(out, config)
         if state is None:
             training = start_training(config, dataset, device, parts=parts)
@@ -124,11 +122,9 @@ def resume(
 
 def _outside(scene: Scene4D) -> str:
     """A warning where the hash grids do not cover the canonical means of many Gaussians; else nothing."""
-    if not isinstance(scene.field, GridField):
-        return ""
     bound = scene.field_config.bound
     count = int((scene.parameters["means"].detach().abs() > bound).any(dim=1).sum())
-    if count < OUTSIDE * len(scene):
+    if not isinstance(scene.field, GridField) or count < OUTSIDE * len(scene):
         return ""
     return (
         f"warning: {count} of {len(scene)} Gaussians lie outside the field's box of half side {bound:g}, where it "
@@ -156,36 +152,32 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
         measured: dict[str, Any] = {"steps": done, "seconds": round(log.seconds, 3)}
         if done == all_steps and (outside := _outside(scene)):
             log.tell(outside)
-        if training.cameras is not None:
-            measured["cameras"] = training.cameras.report()
-            log.tell(training.cameras.summary())
-        if training.timing is not None:
-            measured["image_times"] = training.timing.report()
-            log.tell(training.timing.summary())
+        for name, refinement in (("cameras", training.cameras), ("image_times", training.timing)):
+            if refinement is not None:
+                measured[name] = refinement.report()
+                log.tell(refinement.summary())
 
     return_freed_memory()
     run_folder.save_state(out, training.state())
     training.save(out / "checkpoint.ply")
+    going_on = f"lapgs-train --resume {quoted(out)} goes on."
     if done < all_steps:
         raise KeyboardInterrupt(
-            f"stopped after step {done} of {all_steps}; {out / 'checkpoint.ply'} holds it, and "
-            f"lapgs-train --resume {quoted(out)} goes on."
+            f"stopped after step {done} of {all_steps}; {out / 'checkpoint.ply'} holds it, and {going_on}"
         )
     try:
         evaluate_run(out, scene, training.dataset, config.data, measured, lpips)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
-            "stopped after the last step, while the test views were measured; "
-            f"lapgs-train --resume {quoted(out)} goes on."
+            f"stopped after the last step, while the test views were measured; {going_on}"
         ) from None
     run_folder.drop_states(out)
     return scene
 
 
 def _after_step(out: Path, log: Log, training: Trainer, result: StepResult) -> None:
-    """Log a step; at their intervals, log the mean PSNR of the validation views, or of some training views, and save
-    the state."""
-    log.after_step(training, result)
+    """Log a step; at their intervals, the PSNR of validation views, or of some training views, and save the state."""
+    log.step(result, len(training.scene))
     eval_interval, save_interval = training.config.eval.interval, training.config.schedule.save_interval
     if eval_interval and result.step % eval_interval == 0:
         start, data = time.perf_counter(), training.dataset
@@ -235,14 +227,11 @@ def evaluate_run(
     training: dict[str, Any],
     lpips: Lpips | None = None,
 ) -> None:
-    """Evaluate on the test views; write metrics.json and eval/ of a run folder.
-
-    data: says on which background. training: goes into metrics.json as it is. lpips: as for `evaluate`.
-    """
+    """Evaluate on the test views (`evaluate`); write metrics.json and eval/ of a run folder. data: says on which
+    background. training: goes into metrics.json as it is."""
     folder = out / "eval"
     if folder.is_symlink():
         raise InputError(f"{folder} is a link, and images are written into the run's own folder only; remove it.")
     folder.mkdir(exist_ok=True)
-    with Progress(len(dataset.test), "test views measured") as progress:
-        metrics = evaluate(scene, dataset.test, data.background, folder, lpips=lpips, progress=progress)
+    metrics = evaluate(scene, dataset.test, data.background, folder, lpips=lpips)
     write_metrics(out, {**metrics, "training": training})

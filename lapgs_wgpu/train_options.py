@@ -5,7 +5,7 @@ import json
 import textwrap
 import typing
 
-from lapgs_wgpu.command import DEVICE_HELP, LIST_DEVICES_HELP, HelpFormatter, Parser
+from lapgs_wgpu.command import DEVICE_HELP, LIST_DEVICES_HELP, Parser
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.dataclass_table import did_you_mean
 from lapgs_wgpu.train.presets import ABLATIONS, config_keys, load_config, preset_names
@@ -49,14 +49,7 @@ def parse_options(arguments: list[str]) -> dict[str, typing.Any]:
     presets = preset_names()
     preset = next((word for word in arguments if word in presets), "dnerf")
     help_wanted = "-h" in arguments or "--help" in arguments
-    parser = Parser(
-        "lapgs-train",
-        usage=USAGE,
-        description=DESCRIPTION,
-        epilog=keys_help(preset) if help_wanted else None,
-        formatter_class=HelpFormatter,
-        allow_abbrev=False,
-    )
+    parser = Parser("lapgs-train", DESCRIPTION, usage=USAGE, epilog=keys_help(preset) if help_wanted else None)
     # fmt: off
     add = parser.add_argument
     parts = "; ".join(f"{name} ({text})" for name, (text, _, _) in ABLATIONS.items())
@@ -111,7 +104,10 @@ def keys_help(preset: str) -> str:
             value = getattr(value, part)
         entries = value if isinstance(value, tuple) else (value,)
         shown = " ".join(entry if isinstance(entry, str) else json.dumps(entry) for entry in entries)
-        option = f"{', '.join(_words(name))} {_metavar(kind)}"
+        kinds = typing.get_args(kind) or (kind,)
+        literal = typing.get_origin(kind) is typing.Literal
+        metavar = "|".join(kinds) if literal else " ".join(_METAVARS[each] for each in kinds)
+        option = f"{', '.join(_words(name))} {metavar}"
         text = ": ".join(filter(None, texts)) + (f" [{shown}]" if shown else "")
         first, others = f"  {option:<38}  ", " " * 42
         lines += textwrap.wrap(text, 120, initial_indent=first, subsequent_indent=others, break_on_hyphens=False)
@@ -121,10 +117,3 @@ def keys_help(preset: str) -> str:
 def _words(name: str) -> list[str]:
     """What a key is called on the command line."""
     return [*([SHORTCUTS[name]] if name in SHORTCUTS else []), f"--{name}"]
-
-
-def _metavar(kind: typing.Any) -> str:
-    parts = typing.get_args(kind)
-    if typing.get_origin(kind) is typing.Literal:
-        return "|".join(parts)
-    return " ".join(_METAVARS[part] for part in parts or (kind,))

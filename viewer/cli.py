@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -23,11 +23,6 @@ if TYPE_CHECKING:
 
 _SIZE = (1280, 720)  # of a window or picture, where nothing else says it
 _WITHOUT_WINDOW = "take --backend http to look in a browser (also from another machine), or --screenshot FILE.png"
-
-
-def view_command(arguments: Sequence[str] | None = None) -> int:
-    """Run lapgs-view and return its exit code."""
-    return guarded("lapgs-view", _view, list(sys.argv[1:] if arguments is None else arguments))
 
 
 def _view(arguments: list[str]) -> None:
@@ -83,17 +78,14 @@ def _start(given: Any, state: ViewState) -> None:
         clock.toggle()
 
 
-def _renderer(given: Any, scene: LoadedScene) -> OffscreenRenderer:
+def _picture(given: Any, scene: LoadedScene) -> tuple[OffscreenRenderer, View | None, tuple[int, int], float]:
+    """What draws, the captured view that --view names, and the picture's size and time, given or of that view."""
     from lapgs_wgpu.viewer.offscreen import OffscreenRenderer
 
-    return OffscreenRenderer(scene, given.mode or "rgb", BACKGROUNDS.get(given.background))
-
-
-def _place(given: Any, scene: LoadedScene) -> tuple[View | None, tuple[int, int], float]:
-    """The captured view that --view names, and the picture's size and time: as given, otherwise of that view."""
     view = scene.views[scene.view_number(given.view)] if given.view is not None else None
     size = given.size or ((view.camera.width, view.camera.height) if view else _SIZE)
-    return view, size, given.time if given.time is not None else view.time if view else 0.0
+    time = given.time if given.time is not None else view.time if view else 0.0
+    return OffscreenRenderer(scene, given.mode or "rgb", BACKGROUNDS.get(given.background)), view, size, time
 
 
 def _camera(scene: LoadedScene, view: View | None, size: tuple[int, int]) -> Camera:
@@ -107,9 +99,9 @@ def _screenshot(given: Any, scene: LoadedScene) -> None:
     from lapgs_wgpu.io.atomic import atomic_write
 
     file = _named(given.screenshot, ".png", "--screenshot")
-    view, size, time = _place(given, scene)
+    renderer, view, size, time = _picture(given, scene)
     with atomic_write(file) as target:
-        target.write(encode_png(_renderer(given, scene)(_camera(scene, view, size), time)))
+        target.write(encode_png(renderer(_camera(scene, view, size), time)))
     print(f"{file}: {size[0]}x{size[1]}, time {time:g}")
 
 
@@ -124,7 +116,7 @@ def _video(given: Any, scene: LoadedScene) -> None:
     path = given.path or ("time" if scene.playback.moves else "view")
     if path != "view" and given.time is not None:
         raise InputError(f"--time has no use with --path {path}, along which time passes.")
-    view, wanted, time = _place(given, scene)
+    renderer, view, wanted, time = _picture(given, scene)
     size = max(2, wanted[0] // 2 * 2), max(2, wanted[1] // 2 * 2)  # as the pixel format yuv420p needs it
     if size != wanted:
         print(f"note: mp4 needs even sizes: {size_text(wanted)} becomes {size_text(size)}", file=sys.stderr)
@@ -138,7 +130,7 @@ def _video(given: Any, scene: LoadedScene) -> None:
         first, start = scene.initial_view, view.camera if view else scene.initial_view.camera
         turning = ViewCamera(start, first.focus, first.up)
         cameras = video.orbit_views(turning, size, frames, None if path == "both" else time, first.arc_from(start))
-    video.write_video(file, cameras, frames, fps, _renderer(given, scene))
+    video.write_video(file, cameras, frames, fps, renderer)
     print(f"{file}: {frames} frames of {size_text(size)} at {fps:g} a second")
 
 
@@ -178,6 +170,8 @@ def _named(name: str, ending: str, option: str) -> Path:
         raise InputError(f"{option} {name}: expected a name that ends with {ending}.")
     return Path(name)
 
+
+view_command = partial(guarded, "lapgs-view", _view)
 
 if __name__ == "__main__":
     sys.exit(view_command())

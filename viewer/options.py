@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import PurePath
 from typing import Any
 
-from lapgs_wgpu.command import DEVICE_HELP, LIST_DEVICES_HELP, HelpFormatter, Parser
+from lapgs_wgpu.command import DEVICE_HELP, LIST_DEVICES_HELP, Parser
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.viewer.clock import LOOPS
 from lapgs_wgpu.viewer.render_modes import AHEAD, BACKGROUNDS, MODES
@@ -54,10 +54,8 @@ _JOBS = ("list_devices", "screenshot", "video", "export")
 
 
 def parse_options(arguments: Sequence[str]) -> tuple[Any, str]:
-    """Parse the command line: the options, None where not given, and the job: one of _JOBS, or window.
-
-    Raises InputError where options do not go together; none is silently ignored.
-    """
+    """Parse the command line: the options, None where not given, and the job: one of _JOBS, or window. Raises
+    InputError where options do not go together; none is silently ignored."""
     given = _parse(arguments)
     jobs = [name for name in _JOBS if getattr(given, name) is not None]
     if len(jobs) > 1:
@@ -81,7 +79,7 @@ def _option(name: str) -> str:
 
 
 def _parse(arguments: Sequence[str]) -> Any:
-    parser = Parser("lapgs-view", description=DESCRIPTION, formatter_class=HelpFormatter, allow_abbrev=False)
+    parser = Parser("lapgs-view", DESCRIPTION)
     # fmt: off
     add = parser.add_argument
     # All defaults are None, which tells given options from others.

@@ -10,6 +10,7 @@ of the image motion, over points of the scene, says how much each change is seen
 gradient (CamP, Park et al. 2023).
 """
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -49,16 +50,14 @@ def image_motion(camera: Camera, points: ScenePoints, unit: float) -> Array:
     its center (along the world's axes, radians) and by a shift of it, in units of `unit` world units. Zeros where no
     point is in the image.
     """
-    R = camera.T_cam_world[:3, :3]
-    arm = points.positions - camera.position
+    R, arm = camera.T_cam_world[:3, :3], points.positions - camera.position
     x, y, z = (arm @ R.T).T
-    ahead = z > NEAREST * np.median(z[z > 0]) if (z > 0).any() else z > 0
-    x, y, z, arm, weights = x[ahead], y[ahead], z[ahead], arm[ahead], points.weights[ahead]
-    u, v = x / z, y / z
-    focal, center = camera.K[[0, 1], [0, 1]], camera.K[:2, 2]
-    across, down = focal[0] * u + center[0], focal[1] * v + center[1]
-    inside = (across >= 0) & (across < camera.width) & (down >= 0) & (down < camera.height)
-    u, v, z, arm, weights = u[inside], v[inside], z[inside], arm[inside], weights[inside]
+    pixels, _ = camera.project(points.positions)
+    seen = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1) & (z > 0)
+    if seen.any():
+        seen &= z > NEAREST * np.median(z[z > 0])
+    z, arm, weights = z[seen], arm[seen], points.weights[seen]
+    u, v = x[seen] / z, y[seen] / z
     # The rows of the projection's derivative by the point, along the world's axes.
     rows = np.stack([R[0] - u[:, None] * R[2], R[1] - v[:, None] * R[2]], axis=1) / z[:, None, None]
     J = np.concatenate([np.cross(rows, arm[:, None]), -unit * rows], axis=2)
@@ -84,10 +83,8 @@ class CameraDescent:
         self._square, self._moves = torch.zeros(1, dtype=torch.float64), torch.zeros(1)
 
     def change(self, number: int, gradient: Array, whiten: Array, rate: float) -> Array:
-        """(6,) change of a camera: rotation, radians, and shift, in the units of `image_motion`.
-
-        gradient: (6,) of the loss. rate: of the image's motion, radians.
-        """
+        """(6,) change of a camera: rotation, radians, and shift, in the units of `image_motion`. gradient: (6,) of the
+        loss. rate: of the image's motion, radians."""
         white = whiten @ gradient
         self._moves += 1
         self._steps[number] += 1
@@ -209,14 +206,12 @@ class CameraRefinement:
 
 
 def changed_camera(camera: Camera, change: Array) -> Camera:
-    """A camera after a rotation about its center and a shift.
-
-    change: (6,) rotation vector along the world's axes, radians, and shift, world units.
-    """
+    """A camera after a change (6,): rotation vector about its center along the world's axes, radians; shift, world
+    units."""
     T = camera.T_cam_world.copy()
     T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec(change[:3]).as_matrix().T
     T[:3, 3] = -T[:3, :3] @ (camera.position + change[3:])
-    return Camera(camera.K, T, camera.width, camera.height, camera.near)
+    return dataclasses.replace(camera, T_cam_world=T)
 
 
 def _common_motions(cameras: Sequence[Camera], extent: float) -> Array:
@@ -224,10 +219,9 @@ def _common_motions(cameras: Sequence[Camera], extent: float) -> Array:
     arms = np.stack([camera.position for camera in cameras])
     arms = (arms - arms.mean(axis=0)) / extent
     zero = np.zeros_like(arms)
-    columns = [np.concatenate([zero, arms], axis=1)]
+    columns = [np.hstack([zero, arms])]
     for axis in np.eye(3):
-        columns.append(np.concatenate([zero, np.broadcast_to(axis, arms.shape)], axis=1))
-        columns.append(np.concatenate([np.broadcast_to(axis, arms.shape), np.cross(axis, arms)], axis=1))
+        columns += [np.hstack([zero, zero + axis]), np.hstack([zero + axis, np.cross(axis, arms)])]
     basis, sizes, _ = np.linalg.svd(np.stack([column.ravel() for column in columns], axis=1), full_matrices=False)
     return np.ascontiguousarray(basis[:, sizes > 1e-9 * sizes[0]])
 

@@ -105,8 +105,7 @@ class RatesConfig(Options):
 
     def schedules(self) -> dict[str, Rate]:
         """Parameter name, or group of the field -> schedule."""
-        rates = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return {name: rate if isinstance(rate, Rate) else Rate(rate, rate, 1) for name, rate in rates.items()}
+        return {name: rate if isinstance(rate, Rate) else Rate(rate, rate, 1) for name, rate in vars(self).items()}
 
 
 @dataclass(frozen=True)
@@ -152,10 +151,7 @@ class DensityConfig(Options):
 
 
 class LossWeights(NamedTuple):
-    """Of each term in the loss of an image; a term of weight 0 is not computed.
-
-    l1, ssim (of 1 - SSIM), pyramid and ncc multiply the terms as they are.
-    """
+    """Of the terms in the loss of an image (ssim: of 1 - SSIM); a term of weight 0 is not computed."""
 
     l1: float
     ssim: float

@@ -20,7 +20,7 @@ from lapgs_wgpu.data.views import View, composite
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.progress import Progress
+from lapgs_wgpu.progress import counted
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS
 from lapgs_wgpu.train.host import environment
 from lapgs_wgpu.train.image_metrics import MS_SSIM_SMALLEST, differing_pixels, ms_ssim, psnr, ssim
@@ -40,38 +40,29 @@ def evaluate(
     folder: Path | None = None,
     *,
     lpips: Lpips | None = None,
-    progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Render every view and compare: the content of metrics.json.
+    """Render every view and compare: the content of metrics.json (docs/metrics.md).
 
-    background: black or white. folder: where a picture of each view is written, the ground truth beside the rendering
-    and their error, 4 times enlarged; an existing folder. lpips: None where there are no weights for it. progress:
-    takes a step for each view.
-
-    Each measure is one of an image, then the mean over the images (of PSNR of the dB): psnr over all channels; ssim,
-    that of the loss; ms_ssim; lpips on inputs in [-1, 1], and lpips_unscaled on inputs in [0, 1], as 3DGS's code
-    reports it. Where masks say what moves: psnr_moving and ssim_moving inside them, psnr_still and ssim_still outside,
-    explained the share of the moving pixels that are drawn as they are (`differing_pixels`); a picture off_NAME.png
-    shows such a view from OFF_PATH to the left and right. "not available" stands for what cannot be measured.
-    Raises InputError where there are no views, or a picture or a mask cannot be read.
+    background: black or white. folder: an existing one, where a picture of each view is written (`side_by_side`), and
+    off_NAME.png from OFF_PATH to the left and right of it where a mask says what moves; the progress is then shown.
+    lpips: None where there are no weights for it. Raises InputError where there are no views, or a picture or a mask
+    cannot be read.
     """
     if not views:
         raise InputError("there are no views to measure: most captures have no validation views, only test views.")
     start = time.perf_counter()
     color = torch.full((3,), BACKGROUND_LEVELS[background])
     rows: list[dict[str, Any]] = []
-    for view in views:
+    for view in views if folder is None else counted(views, len(views), "test views measured"):
         truth, image = composite(view.load(), color.numpy()), _render(scene, view, color)
         moving = None if view.moving is None else view.moving()
-        rows.append({"view": view.name, "time": view.time} | _measures(_unit(image), _unit(truth), moving, lpips))
+        rows.append({"view": view.name, "time": view.time} | _measures(image, truth, moving, lpips))
         if folder is not None:
             with atomic_write(folder / f"{view.name}.png") as file:
                 file.write(encode_png(side_by_side(truth, image)))
             if view.moving is not None:
                 with atomic_write(folder / f"off_{view.name}.png") as file:
                     file.write(encode_png(_off_path(scene, view, color)))
-        if progress is not None:
-            progress.step()
     return {
         **{name: _mean(name, [row[name] for row in rows]) for name in MEASURES},
         "gaussians": len(scene),
@@ -89,8 +80,9 @@ def _render(scene: Scene4D, view: View, color: Tensor) -> NDArray[np.uint8]:
 
 
 def _measures(
-    image: Tensor, truth: Tensor, moving: NDArray[np.bool_] | None, lpips: Lpips | None
+    drawn: NDArray[np.uint8], captured: NDArray[np.uint8], moving: NDArray[np.bool_] | None, lpips: Lpips | None
 ) -> dict[str, float | str]:
+    image, truth = (torch.from_numpy(picture.astype(np.float32) / 255) for picture in (drawn, captured))
     side = min(image.shape[:2])
     measures: dict[str, float | str] = dict.fromkeys(MEASURES, NOT_AVAILABLE)
     measures |= {"psnr": psnr(image, truth), "ssim": float(ssim(image, truth))}
@@ -143,7 +135,3 @@ def side_by_side(truth: NDArray[np.uint8], image: NDArray[np.uint8]) -> NDArray[
     """Ground truth | rendering | absolute error, 4 times enlarged: (H, 3 W, 3) of two (H, W, 3) pictures."""
     error = np.abs(truth.astype(np.int32) - image.astype(np.int32)) * ERROR_GAIN
     return np.concatenate([truth, image, error.clip(max=255).astype(np.uint8)], axis=1)
-
-
-def _unit(picture: NDArray[np.uint8]) -> Tensor:
-    return torch.from_numpy(picture.astype(np.float32) / 255)

@@ -68,11 +68,9 @@ class ExposurePasses:
     ) -> None:
         _, height, width = image.shape
         kernel = Kernel.get(self.device, name, LANES=self._lanes)
-
-        def write() -> bytes:
-            return kernel.uniform("Exposure", size=(width, height), first=first())
-
-        exposure = self.pool.varying("exposure", write)
+        exposure = self.pool.varying(
+            "exposure", lambda: kernel.uniform("Exposure", size=(width, height), first=first())
+        )
         commands.dispatch_grid(kernel, (1, height), exposure=exposure, image=image, **arrays)
 
 
@@ -86,9 +84,8 @@ class Exposures:
     name = "exposure"
 
     def __init__(self, count: int, rate: Rate) -> None:
-        self._identity = torch.eye(3, 4)
         self.rate = rate
-        self.values = nn.Parameter(self._identity.repeat(count, 1, 1))
+        self.values = nn.Parameter(torch.eye(3, 4).repeat(count, 1, 1))
         self._mean, self._square = torch.zeros(2, count, 3, 4).unbind()
         self._steps = torch.zeros(count, 1, 1)
 
@@ -105,7 +102,7 @@ class Exposures:
         mean = self._mean[rows] / (1 - MEAN_DECAY ** self._steps[rows])
         size = (self._square[rows] / (1 - SQUARE_DECAY ** self._steps[rows])).sqrt()
         self.values[rows] -= self.rate.at(step) * mean / (size + EPS)
-        self.values.sub_(self.values.mean(dim=0) - self._identity)
+        self.values.sub_(self.values.mean(dim=0) - torch.eye(3, 4))
         self.values.grad = None
 
     def state(self) -> dict[str, Tensor]:

@@ -16,7 +16,6 @@ TERMS = 5  # in the buffer that `record` leaves
 PYRAMID_BANDS = 3  # band-pass levels; below them lies the residual
 DIVISIBLE = 3  # pixels of a level's shorter side, which reflection needs
 NCC_WINDOW = 11
-_WHOLE = 1 << 14  # a lane takes a whole row or column, of a longer side several runs
 
 
 def pyramid_sizes(height: int, width: int) -> list[tuple[int, int]]:
@@ -47,8 +46,9 @@ class ImageLoss:
     def __init__(self, device: Device) -> None:
         self.device = device
         self.pool = BufferPool(device)
-        # On CPUs a workgroup is one vector that walks a whole row or column; GPUs need more lanes than that makes.
-        self._lanes, self._run = (8, _WHOLE) if device.is_cpu else (64, 64)
+        # On CPUs a workgroup is one vector that walks a whole row or column (in several runs, if it is longer than
+        # 16,384 pixels); GPUs need more lanes than that makes.
+        self._lanes, self._run = (8, 1 << 14) if device.is_cpu else (64, 64)
 
     def record(
         self, commands: Commands, image: DeviceArray, truth: DeviceArray, weights: LossWeights
@@ -63,19 +63,17 @@ class ImageLoss:
         """
         height, width = truth.shape
         frame = _Frame(self, commands, height, width, weights)
-        pixels = frame.pixels(image, truth)
-        extra = {}
+        held = self.held(truth)
+        if held.buffer is not truth.buffer:
+            commands.copy(truth, held)
+        frame.pixels(image, held)
         if weights.ssim:
-            extra["ssim"] = frame.ssim(pixels)
+            frame.ssim()
         if frame.ncc_windows:
-            extra["ncc"] = frame.ncc(pixels)
+            frame.ncc()
         if frame.sizes:
-            extra["pyramid"] = frame.pyramid(pixels)
-        terms = frame.sum_up()
-        arrays = {"pixels": pixels, "d_image": self.pool.array("d_image", (4, height, width)), **extra}
-        flags = {name.upper(): 1 for name in extra}
-        frame.run("loss_gradient", frame.grid(width, height, channels=3), arrays, **flags)
-        return terms, arrays["d_image"]
+            frame.pyramid()
+        return frame.sum_up(), frame.gradient()
 
     def held(self, truth: DeviceArray) -> DeviceArray:
         """Where a ground truth (H, W) is copied to: all of a training go through one buffer, texture and bind group."""
@@ -83,11 +81,12 @@ class ImageLoss:
 
 
 class _Frame:
-    """The passes of an image; those of a loss return its gradient. ncc_windows, sizes: 0 and empty without the loss."""
+    """The passes of an image. ncc_windows, sizes: 0 and empty without the loss. arrays: by the names of the bindings in
+    the next pass; ssim, ncc and pyramid are what these losses leave for the gradient."""
 
     def __init__(self, owner: ImageLoss, commands: Commands, height: int, width: int, weights: LossWeights) -> None:
-        self.owner, self.commands, self.weights = owner, commands, weights
-        self.height, self.width = height, width
+        self.device, self.pool, self.lanes, self.length = owner.device, owner.pool, owner._lanes, owner._run
+        self.commands, self.height, self.width, self.weights = commands, height, width, weights
         # With what fills up strips of 8 columns, or of 8 rows: common/picture.wgsl.
         self.places, self.places_across = (width + 7) // 8 * 8 * height, (height + 7) // 8 * 8 * width
         margin = NCC_WINDOW - 1
@@ -96,111 +95,108 @@ class _Frame:
 
         # How many lanes leave partial sums, a term after the other.
         rows = self.runs(width) * height
-        counts = [height * owner._lanes, height * owner._lanes, 3 * rows if weights.ssim else 0]
+        counts = [height * self.lanes, height * self.lanes, 3 * rows if weights.ssim else 0]
         self.pyramid_counts = [self.runs(h) * w for h, w in self.sizes[1:]]
         counts += [sum(self.pyramid_counts), self.runs(width) * (height - margin) if self.ncc_windows else 0]
         self.ends = np.cumsum(counts).tolist()
-        self.sums = owner.pool.array("sums", (self.ends[-1],))
 
         pixel = 1.0 / (3 * height * width)
         window = 1.0 / max(1, self.ncc_windows)
-        kernel = Kernel.get(owner.device, "loss_pixels", LANES=owner._lanes)
         slope = weights.l1 * pixel, weights.ssim * pixel, weights.ncc * (window / NCC_WINDOW**2), 0.0
-        given = {"size": (width, height), "run": owner._run, "slope": slope}
+        given = {"size": (width, height), "run": self.length, "slope": slope}
         given |= {"ssim_first": self.ends[1], "ncc_first": self.ends[3], "value": (pixel, pixel, window, 0.0)}
-        self.picture = owner.pool.varying("picture", lambda: kernel.uniform("Picture", **given))
+        picture = self.pool.varying("picture", lambda: self.kernel("loss_pixels").uniform("Picture", **given))
+        self.arrays = {"picture": picture, "sums": self.pool.array("sums", (self.ends[-1],))}
 
     def runs(self, length: int) -> int:
-        return -(-length // self.owner._run)
+        return -(-length // self.length)
 
     def grid(self, lanes: int, length: int, channels: int = 1) -> tuple[int, int]:
         """Workgroups for so many lanes, each of which takes a run of the length."""
-        return -(-lanes // self.owner._lanes), channels * self.runs(length)
+        return -(-lanes // self.lanes), channels * self.runs(length)
 
-    def run(self, name: str, grid: tuple[int, int], arrays: dict[str, DeviceArray], **defines: int) -> None:
+    def kernel(self, name: str, **defines: bool) -> Kernel:
+        return Kernel.get(self.device, name, LANES=self.lanes, **defines)
+
+    def run(self, name: str, grid: tuple[int, int], **defines: bool) -> None:
         """Record a pass with those of the arrays that it binds."""
-        kernel = Kernel.get(self.owner.device, name, LANES=self.owner._lanes, **defines)
-        given = {"picture": self.picture, "sums": self.sums, **arrays}
-        self.commands.dispatch_grid(kernel, grid, **{binding: given[binding] for binding in kernel.bindings})
+        kernel = self.kernel(name, **defines)
+        self.commands.dispatch_grid(kernel, grid, **{binding: self.arrays[binding] for binding in kernel.bindings})
 
-    def pixels(self, image: DeviceArray, truth: DeviceArray) -> DeviceArray:
-        held = self.owner.held(truth)
-        if held.buffer is not truth.buffer:
-            self.commands.copy(truth, held)
-        pixels = self.owner.pool.array("pixels", (self.places, 4), "uint32")
-        self.run("loss_pixels", (1, self.height), {"image": image, "rgba": held, "pixels": pixels})
-        return pixels
+    def pixels(self, image: DeviceArray, rgba: DeviceArray) -> None:
+        self.arrays |= {"image": image, "rgba": rgba, "pixels": self.pool.array("pixels", (self.places, 4), "uint32")}
+        self.run("loss_pixels", (1, self.height))
 
-    def ssim(self, pixels: DeviceArray) -> DeviceArray:
-        """By the blurs; blurred along the rows."""
-        moments = self.owner.pool.array("ssim moments", (3, self.places_across, 4))
-        slopes = self.owner.pool.array("ssim slopes", (3, self.places, 4))
-        arrays = {"pixels": pixels, "moments": moments, "slopes": slopes}
-        self.run("loss_ssim_down", self.grid(self.width, self.height, channels=3), arrays)
-        self.run("loss_ssim_across", self.grid(self.height, self.width, channels=3), arrays)
-        return slopes
+    def ssim(self) -> None:
+        """By the blurs; leaves their slopes blurred along the rows."""
+        self.arrays["moments"] = self.pool.array("ssim moments", (3, self.places_across, 4))
+        self.arrays["ssim"] = self.arrays["slopes"] = self.pool.array("ssim slopes", (3, self.places, 4))
+        self.run("loss_ssim_down", self.grid(self.width, self.height, channels=3))
+        self.run("loss_ssim_across", self.grid(self.height, self.width, channels=3))
 
-    def ncc(self, pixels: DeviceArray) -> DeviceArray:
+    def ncc(self) -> None:
         """By the luminance. moments: of pixels below each other; slopes: the derivatives, summed along the rows."""
-        pool, rows = self.owner.pool, self.height - NCC_WINDOW + 1
-        arrays = {name: pool.array(f"ncc {name}", (self.places, 4)) for name in ("moments", "slopes")}
-        arrays |= {"pixels": pixels, "truth_variances": pool.array("ncc truth variances", (self.places,))}
-        arrays["d_luminance"] = pool.array("d_luminance", (self.places,))
-        self.run("loss_ncc_down", self.grid(self.width, rows), arrays)
-        self.run("loss_ncc_across", self.grid(rows, self.width), arrays)
-        self.run("loss_ncc_up", self.grid(self.width, self.height), arrays)
-        return arrays["d_luminance"]
+        rows = self.height - NCC_WINDOW + 1
+        self.arrays |= {name: self.pool.array(f"ncc {name}", (self.places, 4)) for name in ("moments", "slopes")}
+        self.arrays["truth_variances"] = self.pool.array("ncc truth variances", (self.places,))
+        self.arrays["ncc"] = self.arrays["d_luminance"] = self.pool.array("d_luminance", (self.places,))
+        self.run("loss_ncc_down", self.grid(self.width, rows))
+        self.run("loss_ncc_across", self.grid(rows, self.width))
+        self.run("loss_ncc_up", self.grid(self.width, self.height))
 
-    def pyramid(self, pixels: DeviceArray) -> DeviceArray:
+    def pyramid(self) -> None:
         """By the difference: down to the residual, and from there up."""
-        owner, pool, bands = self.owner, self.owner.pool, len(self.sizes) - 1
+        arrays, bands = self.arrays, len(self.sizes) - 1
         weights = zip(pyramid_weights(bands + 1), self.sizes, strict=True)
         shares = [weight / (3 * height * width) for weight, (height, width) in weights]
-        first, fine, levels = self.ends[2], pixels, list[dict[str, DeviceArray]]()
+        first, levels = self.ends[2], list[tuple[DeviceArray, DeviceArray]]()  # uniform and signs of each
+        arrays["fine"] = arrays["pixels"]
         for k in range(bands):
             (fine_height, fine_width), (height, width) = self.sizes[k : k + 2]
-            finest, residual = {"FINEST": 1} if k == 0 else {}, {"RESIDUAL": 1} if k == bands - 1 else {}
-            content = Kernel.get(owner.device, "loss_pyramid_band", LANES=owner._lanes, **finest, **residual).uniform(
+            content = self.kernel("loss_pyramid_band", FINEST=k == 0, RESIDUAL=k == bands - 1).uniform(
                 "Level",
                 fine=(fine_width, fine_height),
                 coarse=(width, height),
-                run=owner._run,
+                run=self.length,
                 first=first,
                 value=shares[k],
                 slope=shares[k] * self.weights.pyramid,
                 coarse_value=shares[k + 1],
                 coarse_slope=shares[k + 1] * self.weights.pyramid,
             )
-            level = {"level": pool.constant(content), "fine": fine}
-            level["coarse"] = pool.array(f"level {k + 1}", (height, width, 4))
-            level["signs"] = pool.array(f"signs {k}", (fine_height, fine_width), "uint32")
-            self.run("loss_pyramid_reduce", (-(-width // owner._lanes), height), level, **finest)
-            self.run("loss_pyramid_band", self.grid(width, height), level, **finest, **residual)
-            levels.append(level)
+            signs = self.pool.array(f"signs {k}", (fine_height, fine_width), "uint32")
+            levels.append((self.pool.constant(content), signs))
+            arrays["level"], arrays["signs"] = levels[k]
+            arrays["coarse"] = self.pool.array(f"level {k + 1}", (height, width, 4))
+            self.run("loss_pyramid_reduce", (-(-width // self.lanes), height), FINEST=k == 0)
+            self.run("loss_pyramid_band", self.grid(width, height), FINEST=k == 0, RESIDUAL=k == bands - 1)
             first += self.pyramid_counts[k]
-            fine = level["coarse"]
-        arrays = {"difference": fine}
+            arrays["fine"] = arrays["difference"] = arrays["coarse"]
         for k in range(bands, 0, -1):
             height, width = self.sizes[k]
-            above, residual = levels[k - 1], {"RESIDUAL": 1} if k == bands else {}
-            arrays |= {"above": above["level"], "fine_signs": above["signs"]}
-            arrays["d_level"] = pool.array(f"d_level {k}", (height, width, 4))
-            if not residual:
-                arrays |= {"below": levels[k]["level"], "signs": levels[k]["signs"]}
-            self.run("loss_pyramid_bwd", (-(-width // owner._lanes), height), arrays, **residual)
+            arrays["above"], arrays["fine_signs"] = levels[k - 1]
+            if k < bands:
+                arrays["below"], arrays["signs"] = levels[k]
+            arrays["d_level"] = self.pool.array(f"d_level {k}", (height, width, 4))
+            self.run("loss_pyramid_bwd", (-(-width // self.lanes), height), RESIDUAL=k == bands)
             arrays["d_coarse"] = arrays["d_level"]
-        arrays |= {"level": levels[0]["level"], "signs": levels[0]["signs"]}
-        arrays["d_difference"] = pool.array("d_difference", (self.places, 4))
+        arrays["level"], arrays["signs"] = levels[0]
+        arrays["pyramid"] = arrays["d_difference"] = self.pool.array("d_difference", (self.places, 4))
         height, width = self.sizes[1]
-        self.run("loss_pyramid_finest", (-(-width // owner._lanes), height), arrays, FINEST=1)
-        return arrays["d_difference"]
+        self.run("loss_pyramid_finest", (-(-width // self.lanes), height), FINEST=True)
 
     def sum_up(self) -> DeviceArray:
         """The terms."""
         names = ("l1", "squared", "ssim", "pyramid", "ncc")
         parts = dict(zip(names, zip([0, *self.ends], self.ends, strict=False), strict=True))
-        kernel = Kernel.get(self.owner.device, "loss_sums", LANES=self.owner._lanes)
-        arrays = {"parts": self.owner.pool.constant(kernel.uniform("Parts", **parts))}
-        arrays["terms"] = self.owner.pool.array("terms", (TERMS,))
-        self.run("loss_sums", (TERMS, 1), arrays)
-        return arrays["terms"]
+        self.arrays["parts"] = self.pool.constant(self.kernel("loss_sums").uniform("Parts", **parts))
+        self.arrays["terms"] = self.pool.array("terms", (TERMS,))
+        self.run("loss_sums", (TERMS, 1))
+        return self.arrays["terms"]
+
+    def gradient(self) -> DeviceArray:
+        """By the image."""
+        self.arrays["d_image"] = self.pool.array("d_image", (4, self.height, self.width))
+        flags = {name.upper(): name in self.arrays for name in ("ssim", "ncc", "pyramid")}
+        self.run("loss_gradient", self.grid(self.width, self.height, channels=3), **flags)
+        return self.arrays["d_image"]

@@ -3,7 +3,6 @@
 In torch, differentiable, for any float dtype; all sums have a fixed order.
 """
 
-import functools
 import math
 
 import numpy as np
@@ -29,11 +28,9 @@ def ssim(image: Tensor, target: Tensor, pixels: Tensor | None = None) -> Tensor:
     """Mean structural similarity (Wang et al. 2004) of two (H, W, C) images, as 3DGS and its successors report it.
 
     A Gaussian window of 11x11 pixels and sigma 1.5; beyond the border lies zero, and the mean is over all pixels, or
-    over those of a mask (H, W).
-    (Other libraries leave the border out or pad it otherwise, and give other numbers.)
+    over those of a mask (H, W). (Other libraries leave the border out or pad it otherwise.)
     """
-    a, b = image.permute(2, 0, 1), target.permute(2, 0, 1)
-    luminance, contrast = _similarity(a, b)
+    luminance, contrast = _similarity(image.permute(2, 0, 1), target.permute(2, 0, 1))
     similar = luminance * contrast
     return similar.mean() if pixels is None else similar[:, pixels].mean()
 
@@ -46,22 +43,19 @@ def ms_ssim(image: Tensor, target: Tensor) -> Tensor:
     half zeros); a channel's product over the scales, then the mean over the channels.
     """
     a, b = image.permute(2, 0, 1), target.permute(2, 0, 1)
-    product: Tensor | None = None
+    product = image.new_ones(())
     for level, weight in enumerate(MS_SSIM_WEIGHTS):
         luminance, contrast = (each[:, 5:-5, 5:-5] for each in _similarity(a, b))
         similar = luminance * contrast if level == len(MS_SSIM_WEIGHTS) - 1 else contrast
-        term = similar.mean(dim=(1, 2)).clamp(min=0) ** weight
-        product = term if product is None else product * term
+        product = product * similar.mean(dim=(1, 2)).clamp(min=0) ** weight
         odd = [side % 2 for side in a.shape[1:]]
         a, b = (functional.avg_pool2d(each[None], 2, padding=(odd[0], odd[1]))[0] for each in (a, b))
-    assert product is not None
     return product.mean()
 
 
 def psnr(image: Tensor, target: Tensor) -> float:
     """Peak signal-to-noise ratio in dB over all pixels and channels, at most 100 dB."""
-    squares = (image - target).square().flatten()  # one order of summation, whatever the strides
-    return psnr_of(float(squares.mean()))
+    return psnr_of(float((image - target).square().flatten().mean()))  # summed in one order, whatever the strides
 
 
 def psnr_of(mean_squared_error: float) -> float:
@@ -92,17 +86,11 @@ def _similarity(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
 
 def _blur(planes: Tensor) -> Tensor:
     """(P, H, W) planes under the Gaussian window, rows and columns in turn."""
-    window = _window(planes.dtype, planes.device)
+    x = torch.arange(SSIM_WINDOW, dtype=torch.float64) - SSIM_WINDOW // 2
+    weights = torch.exp(-x * x / (2 * SSIM_SIGMA**2))
+    window = (weights / weights.sum()).to(planes)
     count, margin = len(planes), SSIM_WINDOW // 2
     columns = window.view(1, 1, -1, 1).expand(count, 1, -1, 1)
     rows = window.view(1, 1, 1, -1).expand(count, 1, 1, -1)
     down = functional.conv2d(planes[None], columns, padding=(margin, 0), groups=count)
     return functional.conv2d(down, rows, padding=(0, margin), groups=count)[0]
-
-
-@functools.cache
-def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """(11,) the window along one axis; its sum is 1."""
-    x = torch.arange(SSIM_WINDOW, dtype=torch.float64) - SSIM_WINDOW // 2
-    weights = torch.exp(-x * x / (2 * SSIM_SIGMA**2))
-    return (weights / weights.sum()).to(dtype=dtype, device=device)

@@ -6,17 +6,14 @@ import time
 from collections import Counter, deque
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any, BinaryIO, TextIO
 
 from lapgs_wgpu.errors import InputError, quoted
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.progress import Progress, duration
 from lapgs_wgpu.train.step_result import StepResult
-from lapgs_wgpu.train.trainer import Trainer
 
 INTERVAL = 50  # steps from one line of log.jsonl to the next, over which loss and PSNR are averaged
-_MOST_SECONDS = 1e9  # that a training takes
 
 
 class Log:
@@ -46,13 +43,11 @@ class Log:
     def __enter__(self) -> "Log":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        if kind is not None:
+    def __exit__(self, *error: object) -> None:
+        if error[0] is not None:
             with suppress(Exception):  # one trouble is enough
                 self._take_in()
-        self._progress.__exit__(kind, error, traceback)
+        self._progress.__exit__(*error)
         self._file.close()
 
     @property
@@ -60,12 +55,8 @@ class Log:
         """Since the start, motion discovery included."""
         return time.perf_counter() - self._start
 
-    def after_step(self, trainer: Trainer, result: StepResult, /) -> None:
-        """Take in a step that is done; the loss of one that was skipped does not count. A callback of `Trainer`."""
-        self.step(result, len(trainer.scene))
-
     def step(self, result: StepResult, gaussians: int) -> None:
-        """Take in a step that is done, and the number of Gaussians after it."""
+        """Take in a step that is done (the loss of a skipped one does not count), and the Gaussians after it."""
         step, last = result.step, result.step == self._steps
         self._fresh.append(result)
         self._times.append(time.perf_counter())
@@ -74,8 +65,8 @@ class Log:
         if not self._recent:
             return
         if step % INTERVAL == 0 or last:
-            timing = {"seconds": round(self.seconds, 3), "steps_per_second": round(self._steps_per_second(), 3)}
-            self._write({"step": step, **self._means(), "gaussians": gaussians, "timing": timing})
+            means, rate = self._means(), round(self._steps_per_second(), 3)
+            self._write({"step": step, **means, "gaussians": gaussians}, steps_per_second=rate)
         self._progress.at(step, lambda: self._progress_line(step, gaussians))
 
     def _take_in(self) -> None:
@@ -111,18 +102,18 @@ class Log:
 
     def discovered(self, summary: str) -> None:
         """Take in what motion discovery found, before the first step."""
-        self._write({"step": 0, "discovery": summary, "timing": {"seconds": round(self.seconds, 3)}})
+        self._write({"step": 0, "discovery": summary})
 
     def evaluated(self, step: int, psnr: float, views: str, seconds: float) -> None:
         """Take in the mean PSNR (dB) of views ("val" or "train") after a step, and how long it took to measure."""
         self._start += seconds
         self._times = deque((at + seconds for at in self._times), maxlen=self._times.maxlen)
-        timing = {"seconds": round(self.seconds, 3)}
-        self._write({"step": step, "val_psnr": round(psnr, 4), "val_views": views, "timing": timing})
+        self._write({"step": step, "val_psnr": round(psnr, 4), "val_views": views})
         shown = {"val": "validation", "train": "training"}[views]
         self.tell(f"step {step}: {psnr:.2f} dB on the {shown} views")
 
-    def _write(self, line: dict[str, Any]) -> None:
+    def _write(self, line: dict[str, Any], **timing: float) -> None:
+        line["timing"] = {"seconds": round(self.seconds, 3), **timing}
         try:
             self._file.write((json.dumps(line) + "\n").encode())
         except OSError as error:
@@ -146,7 +137,7 @@ def _continued(path: Path, done: int) -> tuple[BinaryIO, float]:
                 line = json.loads(text)
                 if line["step"] <= done:
                     kept.append(text + "\n")
-                    seconds = min(max(float(line["timing"]["seconds"]), 0.0), _MOST_SECONDS)
+                    seconds = min(max(float(line["timing"]["seconds"]), 0.0), 1e9)
     with atomic_write(path) as file:
         file.write("".join(kept).encode())
     return path.open("ab", buffering=0), seconds  # a line is one write, and none waits for a later one to fail

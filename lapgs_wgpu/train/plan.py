@@ -2,7 +2,6 @@
 
 import math
 import operator
-import statistics
 import time
 from pathlib import Path
 from typing import NamedTuple
@@ -61,13 +60,12 @@ def camera_layout(dataset: Dataset) -> str:
 def step_seconds(config: Config, dataset: Dataset, device: Device) -> float:
     """Time some steps of a training with `points.count` moving Gaussians: the mean, seconds. Writes nothing. Raises
     InputError and DeviceError."""
-    taken = []
     with Trainer(config, dataset, device, scene=start_from_points(config, dataset, device).scene) as trainer:
-        for _ in range(UNTIMED_STEPS + TIMED_STEPS):
+        for count in (UNTIMED_STEPS, TIMED_STEPS):
             start = time.perf_counter()
-            trainer.step()
-            taken.append(time.perf_counter() - start)
-    return statistics.fmean(taken[UNTIMED_STEPS:])
+            for _ in range(count):
+                trainer.step()
+        return (time.perf_counter() - start) / TIMED_STEPS
 
 
 def plan_training(
@@ -93,8 +91,7 @@ def plan_training(
         layout = FILM
     for preset in PRESETS[layout][1:] if device.is_cpu else PRESETS[layout]:
         last = preset == PRESETS[layout][1]
-        own = {"exposure.enabled": True} if exposure else {}
-        config = load_config(preset, {"data.path": str(folder.resolve())} | own)
+        config = load_config(preset, {"data.path": str(folder.resolve()), "exposure.enabled": exposure})
         # No densification beyond twice the initial number, so that the measured step tells of the whole training.
         config = changed(config, {"density.limit": 2 * config.points.count})
         dataset = open_dataset(config)

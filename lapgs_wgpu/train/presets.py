@@ -9,7 +9,7 @@ import importlib.resources
 import json
 import os
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +20,6 @@ from lapgs_wgpu.motion.fields.config import Method
 from lapgs_wgpu.train.config import Config
 
 Table = dict[str, Any]
-ADVICE = '; add it, or start the file with base = "dnerf"'
-
 # The paper's parts beside its field: off for every other method.
 PAPER_ONLY = {"loss.pyramid": 0.0, "loss.ncc": 0.0, "density.split": "plain"}
 # The parts of the method that --ablate turns off: help text, key, and value of the key without the part.
@@ -35,8 +33,6 @@ ABLATIONS: dict[str, tuple[str, str, Any]] = {
     "hash": ("space-time hash grids", "field.temporal_hash", False),
     "appearance": ("color changes over time", "field.appearance", "none"),
 }
-
-_SCENES = "published-scenes"  # the file with presets of single scenes
 
 
 def preset_names() -> list[str]:
@@ -74,7 +70,7 @@ def load_config(
         for part in reversed(key.split(".")):
             value = {part: value}
         base = _merge(base, value)
-    return build_dataclass(Config, base, preset, advice=ADVICE)
+    return build_dataclass(Config, base, preset, advice='; add it, or start the file with base = "dnerf"')
 
 
 def _shorthands(method: str | None, ablate: Iterable[str]) -> dict[str, Any]:
@@ -102,9 +98,15 @@ def config_keys(cls: type = Config, prefix: str = "") -> dict[str, Any]:
     return keys
 
 
-def write_toml(table: Mapping[str, Any]) -> str:
-    """TOML text of nested dictionaries of texts, numbers, truth values and tuples."""
-    return "\n".join(_toml_lines(table, "")).strip() + "\n"
+def write_toml(table: Mapping[str, Any], prefix: str = "") -> str:
+    """TOML text of nested dictionaries of texts, numbers, truth values and tuples. prefix: of their names."""
+    values, tables = "", ""
+    for key, value in table.items():
+        if isinstance(value, Mapping):
+            tables += f"\n[{prefix}{key}]\n{write_toml(value, f'{prefix}{key}.')}"
+        else:  # what JSON writes is TOML, but for one character
+            values += f"{key} = {json.dumps(value, ensure_ascii=False)}\n".replace("\x7f", "\\u007f")
+    return values + tables
 
 
 def _read(preset: str, seen: tuple[str, ...] = ()) -> Table:
@@ -142,7 +144,7 @@ def _packaged() -> dict[str, Table]:
     """The tables of configs/ by name. No caller changes them."""
     folder = Path(str(importlib.resources.files("lapgs_wgpu.configs")))
     presets = {file.stem: read_toml(file) for file in folder.glob("*.toml")}
-    return presets | presets.pop(_SCENES)
+    return presets | presets.pop("published-scenes")  # each table of which is a preset
 
 
 def _remove_unknown(table: Table, cls: type, prefix: str = "") -> list[str]:
@@ -157,21 +159,8 @@ def _remove_unknown(table: Table, cls: type, prefix: str = "") -> list[str]:
     return gone
 
 
-def _merge(below: Table, above: Table) -> Table:
-    """A nested table with another one laid over it."""
-    merged = dict(below)
-    for key, value in above.items():
-        both = isinstance(value, dict) and isinstance(below.get(key), dict)
-        merged[key] = _merge(below[key], value) if both else value
-    return merged
-
-
-def _toml_lines(table: Mapping[str, Any], prefix: str) -> Iterator[str]:
-    inner = {key: value for key, value in table.items() if isinstance(value, Mapping)}
-    for key, value in table.items():
-        if key not in inner:  # what JSON writes is TOML, but for one character
-            text = json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-            yield f"{key} = {text}"
-    for key, value in inner.items():
-        yield from ("", f"[{prefix}{key}]")
-        yield from _toml_lines(value, f"{prefix}{key}.")
+def _merge(below: Any, above: Any) -> Any:
+    """A nested table with another one laid over it, of other values the one above."""
+    if not (isinstance(below, dict) and isinstance(above, dict)):
+        return above
+    return below | {key: _merge(below.get(key), value) for key, value in above.items()}

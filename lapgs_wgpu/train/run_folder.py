@@ -145,12 +145,10 @@ def load_state(out: Path) -> dict[str, NDArray[Any]] | None:
 
 def check_state(state: State, *, views: int, steps: int) -> None:
     """Check that a state matches view and step counts, and is consistent. Raises KeyError or ValueError."""
-    done, degree, order = (state[f"training.{name}"] for name in ("done", "sh_degree", "order"))
-    for name, value, most in (("done", done, steps), ("sh_degree", degree, 3)):
-        if value.shape != () or value.dtype.kind != "i" or not 0 <= value <= most:
-            raise ValueError(f"its {name} is not a whole number from 0 to {most}")
-    if order.ndim != 1 or order.dtype.kind != "i" or not ((order >= 0) & (order < views)).all():
-        raise ValueError(f"its order is not made of numbers from 0 to {views - 1}")
+    for name, dimensions, most in (("done", 0, steps), ("sh_degree", 0, 3), ("order", 1, views - 1)):
+        value = state[f"training.{name}"]
+        if value.ndim != dimensions or value.dtype.kind != "i" or not ((value >= 0) & (value <= most)).all():
+            raise ValueError(f"its {name} is not made of whole numbers from 0 to {most}")
     count = state["gaussians.means"].shape[:1]
     for name, array in state.items():
         part = name.partition(".")[0]

@@ -47,10 +47,7 @@ def set_up(
     if scene is not None and parts.field is not None:
         raise InputError("the scene to start from keeps its own field; leave out Parts(field=...).")
     if scene is not None and scene.antialiased != config.antialiased:
-        raise InputError(
-            f"the scene to start from is drawn with antialiased = {scene.antialiased}, and the configuration says "
-            f"{config.antialiased}; give the configuration the scene's."
-        )
+        raise InputError(f"the scene to start from has antialiased = {scene.antialiased}; give the configuration that.")
     if dataset is None:
         config = resolve_data(config, Path("runs"))
         dataset = open_dataset(config)
@@ -58,10 +55,7 @@ def set_up(
     if scene is not None:
         config = dataclasses.replace(config, field=scene.field_config)
     elif parts.field is not None:
-        try:
-            config = changed(config, {"field.kind": "own"})
-        except ValueError as error:
-            raise InputError(f"{error}.") from None
+        config = changed(config, {"field.kind": "own"})
     user_config = resolve_step(config, device, parts)
     resolved = resolve_for_dataset(user_config, dataset)
     if scene is not None:  # whose field does not change its shape any more
@@ -72,12 +66,11 @@ def set_up(
 def resolve_data(config: Config, scenes: Path) -> Config:
     """The configuration with the absolute paths of its data. scenes: folder into which the built-in scene is written,
     unless it is there. Raises InputError."""
-    path = config.data.path
+    path, masks = config.data.path, config.data.masks
     if not path:
         raise InputError(f"the configuration names no data; give --data DIR (in Python data.path), or {SYNTHETIC}.")
     folder = write_built_in(scenes / SYNTHETIC) if path == SYNTHETIC else Path(path)
-    masks = str(Path(config.data.masks).resolve()) if config.data.masks else ""
-    return changed(config, {"data.path": str(folder.resolve()), "data.masks": masks})
+    return changed(config, {"data.path": str(folder.resolve()), "data.masks": masks and str(Path(masks).resolve())})
 
 
 def open_dataset(config: Config) -> Dataset:
@@ -94,9 +87,7 @@ def open_dataset(config: Config) -> Dataset:
 
 def resolve_for_dataset(config: Config, dataset: Dataset) -> Config:
     """The configuration with lengths in world units, and no more frequencies than the training times can tell apart.
-
-    Raises InputError where the data do not allow it.
-    """
+    Raises InputError where these are too many to be refined."""
     if config.timing.refine and len(dataset.times) > MOST_TIMES:
         raise InputError(
             f"{dataset.name} has {len(dataset.times)} times, and timing.refine takes {MOST_TIMES} at most; give "
@@ -135,9 +126,7 @@ def why_exchange(config: Config, parts: Parts) -> str:
     """What of a training only torch can compute; "" where there is nothing."""
     if config.field.kind != "static" and not config.field.decodes_on_device:
         return f"there are no kernels for the field {config.field.kind} in this shape"
-    if parts.losses:
-        return "losses of one's own are torch's"
-    return ""
+    return "losses of one's own are torch's" if parts.losses else ""
 
 
 @dataclass(frozen=True)
@@ -160,10 +149,8 @@ class Start:
 
 
 def start_from_points(config: Config, dataset: Dataset, device: Device, own_field: nn.Module | None = None) -> Start:
-    """Start from initial points, and without motion in the first `schedule.warm_up` steps.
-
-    config: resolved for the dataset. Raises InputError where its field is `own`, and there is no module.
-    """
+    """Start from initial points, and without motion in the first `schedule.warm_up` steps. config: resolved for the
+    dataset. Raises InputError where its field is `own`, and there is no module."""
     scene = Scene4D.from_points(
         *initial_points(config.points, dataset, config.seed),
         config.field,
