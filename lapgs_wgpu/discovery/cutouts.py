@@ -82,24 +82,22 @@ def cutout_tracks(
     if not cutouts:
         return None, 0.0
     ground = [_depths(mask, depth) for mask, depth in zip(masks, depths, strict=True)]
-    parts = [_placed(cutout, residuals, ground, POINTS // len(cutouts)) for cutout in cutouts]
-    number = np.repeat(np.arange(len(parts)), [len(colors) for _, colors in parts])
-    paths = np.concatenate([paths for paths, _ in parts], axis=1)
+    placed = [_placed(cutout, residuals, ground, POINTS // len(cutouts)) for cutout in cutouts]
+    paths, colors = (np.concatenate(each, axis=-2) for each in zip(*placed, strict=True))
+    number = np.repeat(np.arange(len(cutouts)), [len(own) for _, own in placed])
     seen = np.stack([cutout.seen for cutout in cutouts], axis=1)
     way = _common_way(paths, seen[:, number], np.array([each.time for each in residuals]))
     for k in range(len(cutouts)):  # beyond, it goes as all go
-        first, last = np.flatnonzero(seen[:, k])[[0, -1]]
-        own = number == k
-        paths[:first, own] = paths[first, own] + (way[:first] - way[first])[:, None]
-        paths[last + 1 :, own] = paths[last, own] + (way[last + 1 :] - way[last])[:, None]
+        shown, own = np.flatnonzero(seen[:, k]), number == k
+        nearest = np.arange(len(seen)).clip(shown[0], shown[-1])
+        paths[:, own] = paths[np.ix_(nearest, own)] + (way - way[nearest])[:, None]
     _show_nearest(cutouts, seen)
     keys = np.array([cutout.key for cutout in cutouts])
     ahead = np.mean([each.camera.T_cam_world[2, :3] for each in residuals], axis=0).astype(np.float32)
-    apart = np.linspace(*APART, len(parts), dtype=np.float32)[np.argsort(np.argsort(keys))]
+    apart = np.linspace(*APART, len(cutouts), dtype=np.float32)[np.argsort(np.argsort(keys))]
     positions = (paths - way[:, None])[keys[number], np.arange(len(number))]
     positions += half_side * apart[number][:, None] * ahead - positions.mean(axis=0)
-    tracks = Tracks(positions, np.concatenate([colors for _, colors in parts]), number, paths, seen[:, number])
-    return tracks, float((known & masks).sum() / masks.sum())
+    return Tracks(positions, colors, number, paths, seen[:, number]), float((known & masks).sum() / masks.sum())
 
 
 def _show_nearest(cutouts: Sequence[_Cutout], seen: Mask) -> None:
@@ -138,12 +136,8 @@ def _common_way(paths: Floats, seen: Mask, times: NDArray[np.float64]) -> Floats
 def _levels(residual: Residual) -> list[Floats]:
     """For each of BLURS (H, W, 12): colors and mask, and their slopes along x and along y."""
     planes = np.concatenate([residual.image, residual.mask[..., None]], axis=2).astype(np.float32)
-    levels = []
-    for blur in BLURS:
-        blurred = ndimage.gaussian_filter(planes, (blur, blur, 0))
-        along_y, along_x = np.gradient(blurred, axis=(0, 1))
-        levels.append(np.concatenate([blurred, along_x, along_y], axis=2))
-    return levels
+    blurred = (ndimage.gaussian_filter(planes, (blur, blur, 0)) for blur in BLURS)
+    return [np.concatenate([each, *np.gradient(each, axis=(1, 0))], axis=2) for each in blurred]
 
 
 def _followed(levels: Sequence[list[Floats]], masks: Mask, key: int, pixels: NDArray[np.int64]) -> _Cutout:
@@ -234,13 +228,12 @@ def _depths(mask: Mask, depth: Floats) -> Floats:
         if len(rows) < LEAST * mask.size:
             continue
         lowest = np.full(mask.shape[1], -1)
-        np.maximum.at(lowest, columns, rows)
-        at = np.flatnonzero(lowest >= rows.max() - FOOT * (np.ptp(rows) + 1))
-        below = lowest[at] + FAR_BELOW
-        ground = free[below[below < mask.shape[0]], at[below < mask.shape[0]]]
-        if np.isfinite(ground).mean() < 0.3 if len(ground) else True:  # below the image
+        lowest[columns] = rows  # ascending
+        at = np.flatnonzero((lowest >= rows[-1] - FOOT * (np.ptp(rows) + 1)) & (lowest < len(mask) - FAR_BELOW))
+        ground = free[lowest[at] + FAR_BELOW, at]
+        if not len(ground) or np.isfinite(ground).mean() < 0.3:  # below the image
             ring = ndimage.binary_dilation(part, iterations=8)
-            ground = np.sort(free[ring][np.isfinite(free[ring])])[: max(1, int(0.3 * ring.sum()))]
+            ground = np.sort(free[ring])[: max(1, int(0.3 * ring.sum()))]
         behind = depth[part][np.isfinite(depth[part])]
         nearest = [np.nanmedian(ground)] if np.isfinite(ground).any() else []
         nearest += [np.quantile(behind, HIDDEN)] if len(behind) else []
@@ -255,23 +248,18 @@ def _placed(cutout: _Cutout, images: Sequence[Residual], depths: Sequence[Floats
     x, y = chosen.T
     at = np.einsum("tij,jn->tin", cutout.maps[:, :, :2], chosen.T) + cutout.maps[:, :, 2:]
     height, width = depths[0].shape
-    depth = np.full(len(images), np.nan)
-    for t in np.flatnonzero(cutout.seen).tolist():
+    seen = np.flatnonzero(cutout.seen).tolist()
+    inverse: dict[int, float] = {}
+    for t in seen:
         column, row = np.rint(at[t]).astype(np.int64).clip(0, [[width - 1], [height - 1]])
         near = depths[t][row, column]
         if np.isfinite(near).any():
-            depth[t] = np.nanmedian(near)
-    depth = _smooth(depth)
+            inverse[t] = 1 / float(np.nanmedian(near))
+    depth = np.ones(len(images))
+    if inverse:  # nearly a line over a few times
+        filled = np.interp(np.arange(len(images)), list(inverse), list(inverse.values()))
+        depth = 1 / ndimage.gaussian_filter1d(ndimage.median_filter(filled, 9, mode="nearest"), 3.0, mode="nearest")
     paths = np.zeros((len(images), len(chosen), 3), np.float32)
-    for t in np.flatnonzero(cutout.seen).tolist():
+    for t in seen:
         paths[t] = points_at(images[t].camera, at[t].T + 0.5, depth[t : t + 1])
     return paths, images[cutout.key].image[y, x].astype(np.float32)
-
-
-def _smooth(depth: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(T,) depths whose inverses are nearly a line over a few times."""
-    known = np.isfinite(depth)
-    if not known.any():
-        return np.ones_like(depth)
-    filled = np.interp(np.arange(len(depth)), np.flatnonzero(known), 1 / depth[known])
-    return 1 / ndimage.gaussian_filter1d(ndimage.median_filter(filled, 9, mode="nearest"), 3.0, mode="nearest")

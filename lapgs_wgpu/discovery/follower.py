@@ -54,10 +54,9 @@ class Follower:
         part = clouds.parts(template)
         kept = np.bincount(part)[part] >= LEAST_PART
         self.positions, self.colors = template.positions[kept], template.colors[kept]
-        self.part = np.unique(part[kept], return_inverse=True)[1].ravel()
-        sizes = np.bincount(self.part) if len(self.part) else np.zeros(0, np.int64)
+        self.part = np.unique(part[kept], return_inverse=True)[1]
         # Large parts choose first: what they explain is less attractive to the small ones.
-        members = [np.flatnonzero(self.part == k) for k in np.argsort(-sizes, kind="stable")]
+        members = [np.flatnonzero(self.part == k) for k in np.argsort(-np.bincount(self.part), kind="stable")]
         self._parts = [_Part(each, self._expected(each, trajectories)) for each in members]
         same = self.part[:, None] == self.part[None]
         sq_distances = ((self.positions[:, None] - self.positions[None]) ** 2).sum(axis=2)
@@ -88,8 +87,8 @@ class Follower:
         past: dict[int, list[int]] = {1: [key], -1: [key]}  # times in the order in which a side was followed
         for i in sorted(range(len(times)), key=lambda i: (abs(i - key), i))[1:]:
             side = 1 if i > key else -1
-            known = past[side] if len(past[side]) >= MEMORY else past[-side][1:MEMORY][::-1] + past[side]
-            start = self._predict(times[known[-MEMORY:]], paths[known[-MEMORY:]], times[i])
+            known = (past[-side][:0:-1] + past[side])[-MEMORY:]
+            start = self._predict(times[known], paths[known], times[i])
             paths[i] = self._register(start, i, first=len(past[side]) == 1)
             past[side].append(i)
         return paths
@@ -146,9 +145,8 @@ class Follower:
         reaches, spreads = np.array([reach, 1.0], np.float32), np.array([widening, 1.0]) * PRIOR * self._unit
 
         def prior(shifts: Floats) -> NDArray[np.float64]:
-            sq_distances = [((shifts - start) ** 2).sum(axis=1) for start in starts]
-            likely = [np.exp(-sq / (2 * spread**2)) for sq, spread in zip(sq_distances, spreads, strict=False)]
-            return np.max(likely, axis=0)
+            pairs = zip(starts, spreads, strict=False)
+            return np.max([np.exp(-((shifts - at) ** 2).sum(axis=1) / (2 * spread**2)) for at, spread in pairs], axis=0)
 
         shifts = np.concatenate([start + scale * self._rough for start, scale in zip(starts, reaches, strict=False)])
         rough, _ = self._explained(part, positions, points, free, shifts, SEARCH_SPREADS[0])

@@ -40,8 +40,11 @@ class Residual:
 
     def __init__(self, camera: Camera, time: float, image: Floats, still: Floats, moving: Mask | None = None) -> None:
         self.camera, self.time, self.image, self.still = camera, time, image, still
-        differs = differing_pixels(image, still)
-        self.mask = differs if moving is None else _completed(moving, differs)
+        self.mask = differing_pixels(image, still)
+        if moving is not None:  # masks from flow lack legs that are too fast for it
+            labels, count = ndimage.label(ndimage.binary_fill_holes(self.mask))
+            told = ndimage.mean(moving, labels, np.arange(count) + 1)
+            self.mask = moving | np.isin(labels, 1 + np.flatnonzero(told > PARTLY))
 
     @cached_property
     def _soft(self) -> Floats:
@@ -86,10 +89,3 @@ class Residual:
         u, v = (columns + 0.5 - K[0, 2]) / K[0, 0], (rows + 0.5 - K[1, 2]) / K[1, 1]
         directions = np.stack([u, v, np.ones(len(rows))], axis=1) @ self.camera.T_cam_world[:3, :3]
         return directions.astype(np.float32), self._blurred[rows, columns], self.image[rows, columns]
-
-
-def _completed(moving: Mask, differs: Mask) -> Mask:
-    """The moving pixels, and the rest of what differs where they tell a part: legs too fast for masks from flow."""
-    labels, count = ndimage.label(ndimage.binary_fill_holes(differs))
-    told = ndimage.mean(moving, labels, np.arange(count) + 1)
-    return moving | np.isin(labels, 1 + np.flatnonzero(told > PARTLY))

@@ -204,9 +204,8 @@ def _smooth(groups: _Groups, path: list[int], *, alone: bool = False, bent: bool
     weights = counted * np.exp(-0.5 * (lapses / (WINDOW + np.where(leapt, 0.5, 1.0) * nearest)) ** 2)
     result = np.zeros((len(lapses), 3), np.float32)
     for i, (weight, lapse) in enumerate(zip(weights, lapses, strict=True)):
-        basis = np.vander(lapse, 3 if leapt[i, 0] else 2, increasing=True)
+        ridge = [0.0, 1e-3, 1e-2] if leapt[i, 0] else [0.0, 1e-3 + nearest[i, 0]]  # its ends hardly go on
+        basis = np.vander(lapse, len(ridge), increasing=True)
         product = basis.T * weight
-        # Beyond its ends a path hardly goes on.
-        ridge = np.diag([0.0, 1e-3, 1e-2] if leapt[i, 0] else [0.0, 1e-3 + nearest[i, 0]])
-        result[i] = np.linalg.solve(product @ basis + ridge, product @ centers)[0]
+        result[i] = np.linalg.solve(product @ basis + np.diag(ridge), product @ centers)[0]
     return result
