@@ -34,13 +34,12 @@ def rows_with(static: Scene4D, tracks: Tracks, *, sheets: bool = False) -> dict[
     sheets: whether each part is a sheet of its own, which nothing lies behind. They are the parameters of a scene
     without a field, float32.
     """
-    if sheets:
-        scales = np.empty(len(tracks.part), np.float32)
-        for part in np.unique(tracks.part):
-            scales[tracks.part == part] = SHEET_SCALE * initial_scales(tracks.positions[tracks.part == part])
-    else:
-        scales = SCALE * initial_scales(tracks.positions)
-    new = isotropic_rows(tracks.positions, tracks.colors, scales, SHEET_OPACITY if sheets else OPACITY)
+    scale, opacity = (SHEET_SCALE, SHEET_OPACITY) if sheets else (SCALE, OPACITY)
+    apart = tracks.part if sheets else np.zeros_like(tracks.part)
+    scales = np.empty(len(apart), np.float32)
+    for k in np.unique(apart):
+        scales[apart == k] = scale * initial_scales(tracks.positions[apart == k])
+    new = isotropic_rows(tracks.positions, tracks.colors, scales, opacity)
     return {name: torch.cat([static.parameters[name].detach(), values]) for name, values in new.items()}
 
 
@@ -60,11 +59,9 @@ def tracks_in_images(
     kept, too.
     """
     judges = evenly(images, IMAGES)
-    kept = np.zeros(tracks.parts, bool)
-    for k in range(len(kept)):
-        moving, gain = _shares(tracks.rows(tracks.part == k), times, judges, static, background)
-        kept[k] = moving >= MOVING or (together and gain >= GAIN)
-    return tracks.of_parts(kept)
+    parts = (tracks.rows(tracks.part == k) for k in range(tracks.parts))
+    shares = [_shares(part, times, judges, static, background) for part in parts]
+    return tracks.of_parts(np.array([moving >= MOVING or (together and gain >= GAIN) for moving, gain in shares]))
 
 
 def _shares(

@@ -109,36 +109,33 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
     generator = torch.Generator().manual_seed(config.seed)
     found = _in_hull(config, dataset, device) if dataset.is_surrounded else None
     found = found or _in_residuals(config, dataset, device, generator)
-    static, tracks, sheets, light = found.static, found.tracks, found.sheets, found.light
+    static, tracks, times, share, origin, light, sheets, corrections = found
     scene = scene_with(static, tracks, config, generator, own_field, sheets=sheets)
-    summary = f"{found.share:.1%} of what it lacks can be followed: nothing is added"
+    field_fitted, summary = 0.0, f"{share:.1%} of what it lacks can be followed: nothing is added"
     if tracks is not None:
-        steps = config.discovery.field_steps
+        steps, parts = config.discovery.field_steps, len(np.unique(tracks.part))
         meter = Progress(steps, "steps of motion discovery, part 2 of 2: what moves")
-        error = fit_field(scene, tracks, found.times, steps, generator, meter.at, fades=sheets, light=light)
+        error = fit_field(scene, tracks, times, steps, generator, meter.at, fades=sheets, light=light)
         meter.clear()
         if error is None:
             summary = "the field cannot move what it lacks: nothing is added"
-            tracks, scene = None, scene_with(static, None, config, generator, own_field, sheets=False)
+            scene = scene_with(static, None, config, generator, own_field, sheets=False)
         else:
-            rigid = f", {len(light)} of them as rigid bodies" if light else ""
             summary = (
-                f"{len(np.unique(tracks.part))} moving parts with {len(tracks.part)} Gaussians, {found.share:.0%} of "
-                f"what it lacks, followed within {error:.3f} world units{rigid}"
+                f"{parts} moving parts with {len(tracks.part)} Gaussians, {share:.0%} of what it lacks, followed "
+                f"within {error:.3f} world units" + (f", {len(light)} of them as rigid bodies" if light else "")
             )
+            if share >= NEARLY_ALL:
+                field_fitted = ALL_TURN if len(light) == parts else SHEETS if sheets else 1.0
     order = morton_order(scene.parameters["means"].detach())
     for name, values in scene.parameters.items():
         scene.parameters[name] = torch.nn.Parameter(values.detach()[order])
-    field_fitted = 0.0
-    if tracks is not None and found.share >= NEARLY_ALL:
-        all_turn = len(light) == len(np.unique(tracks.part))
-        field_fitted = ALL_TURN if all_turn else SHEETS if sheets else 1.0
     return Start(
         scene,
         ramp_steps=config.schedule.warm_up or RAMP_STEPS,
         field_fitted=field_fitted,
-        corrections=found.corrections,
-        summary=f"{found.origin} of {len(static)} Gaussians; {summary}",
+        corrections=corrections,
+        summary=f"{origin} of {len(static)} Gaussians; {summary}",
         seconds=time.perf_counter() - started,
     )
 
@@ -198,7 +195,7 @@ def _in_residuals(config: Config, dataset: Dataset, device: Device, generator: t
         share = explained_share(clouds, tracks)
     if share < config.discovery.least:
         tracks = None
-    if tracks is not None and depths is None:
+    elif tracks is not None and depths is None:
         stands, turns = find_turns(tracks, times, images)
         if turns:
             tracks, light = rigid_tracks(tracks, stands, turns, times, images, device, generator)

@@ -72,7 +72,8 @@ class Tracks(NamedTuple):
 
     def rows(self, chosen: NDArray[np.bool_]) -> "Tracks":
         """The tracks (n,) that are set, with the numbers of their parts."""
-        return Tracks(*(each[chosen] for each in self[:3]), *(each[:, chosen] for each in self[3:]))
+        of_time = self.paths[:, chosen], self.supported[:, chosen]
+        return Tracks(self.positions[chosen], self.colors[chosen], self.part[chosen], *of_time)
 
 
 def all_of(tracks: Sequence[Tracks]) -> Tracks:
