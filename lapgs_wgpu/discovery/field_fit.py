@@ -56,8 +56,8 @@ def fit_field(
     if not groups:
         return None
     if (fades or light) and (head := getattr(field, "appearance", None)) is not None:  # outputs in that unit
-        own = {id(parameter) for parameter in head.parameters()}
-        groups = [(rate, [each for each in parameters if id(each) not in own]) for rate, parameters in groups]
+        own = set(head.parameters())
+        groups = [(rate, [each for each in parameters if each not in own]) for rate, parameters in groups]
         groups.append((MLP_RATE / APPEARANCE_SCALE, list(head.parameters())))
     if fades and isinstance(field, GridField) and field.config.dynamics_size > 1 and field.config.temporal_hash:
         _tell_times(field, generator)
@@ -79,10 +79,9 @@ def fit_field(
     errors: list[float] = []
     at_once, most = (AT_ONCE, MOVING // FEWER) if fades else (1, MOVING)
     for step in range(steps):
-        now: list[int] = []
-        for _ in range(at_once):
-            order = order or torch.randperm(len(times), generator=generator).tolist()
-            now.append(order.pop())
+        while len(order) < at_once:
+            order = torch.randperm(len(times), generator=generator).tolist() + order
+        now = [order.pop() for _ in range(at_once)]
         staying = torch.randint(max(still, 1), (min(still, STILL),), generator=generator)
         if len(tracks.part) > most:
             asked = torch.randint(len(tracks.part), (most,), generator=generator)
