@@ -64,21 +64,21 @@ def cutout_tracks(
     """
     levels = [_levels(each) for each in residuals]
     masks = np.stack([each.mask for each in residuals])
-    known, least = np.zeros_like(masks), LEAST * masks[0].size
+    rest, least = masks.copy(), LEAST * masks[0].size
     cutouts: list[_Cutout] = []
-    rest = masks.sum(axis=(1, 2))
-    enough = np.maximum(ENOUGH * rest, least)
-    while len(cutouts) < MOST and (rest > enough).any():
-        key = int(np.argmax(rest))
+    sizes = masks.sum(axis=(1, 2))
+    enough = np.maximum(ENOUGH * sizes, least)
+    while len(cutouts) < MOST and (sizes > enough).any():
+        key = int(np.argmax(sizes))
         labels, count = ndimage.label(ndimage.binary_opening(masks[key]))
         for label in range(1, count + 1):
             part = labels == label
-            if (part & ~known[key]).sum() > max(ENOUGH * part.sum(), least):
+            if (part & rest[key]).sum() > max(ENOUGH * part.sum(), least):
                 rows, columns = np.nonzero(part)
                 cutouts.append(_followed(levels, masks, key, np.stack([columns, rows], axis=1)))
-                known |= cutouts[-1].explained
+                rest &= ~cutouts[-1].explained
         enough[key] = np.inf
-        rest = np.where(np.isinf(enough), 0, (masks & ~known).sum(axis=(1, 2)))
+        sizes = np.where(np.isinf(enough), 0, rest.sum(axis=(1, 2)))
     if not cutouts:
         return None, 0.0
     ground = [_depths(mask, depth) for mask, depth in zip(masks, depths, strict=True)]
@@ -97,7 +97,7 @@ def cutout_tracks(
     apart = np.linspace(*APART, len(cutouts), dtype=np.float32)[np.argsort(np.argsort(keys))]
     positions = (paths - way[:, None])[keys[number], np.arange(len(number))]
     positions += half_side * apart[number][:, None] * ahead - positions.mean(axis=0)
-    return Tracks(positions, colors, number, paths, seen[:, number]), float((known & masks).sum() / masks.sum())
+    return Tracks(positions, colors, number, paths, seen[:, number]), float((masks & ~rest).sum() / masks.sum())
 
 
 def _show_nearest(cutouts: Sequence[_Cutout], seen: Mask) -> None:
@@ -121,15 +121,13 @@ def _common_way(paths: Floats, seen: Mask, times: NDArray[np.float64]) -> Floats
     """(T, 3) how far all tracks have moved on average since half of the clip: where none is seen at two times one after
     another, as fast as before and after."""
     lapses = np.diff(times)
-    speeds = np.full((len(lapses), 3), np.nan)
-    for t, both in enumerate(seen[1:] & seen[:-1]):
-        if both.any():
-            speeds[t] = (paths[t + 1, both] - paths[t, both]).mean(axis=0) / lapses[t]
-    known = np.flatnonzero(np.isfinite(speeds[:, 0]))
+    both = seen[1:] & seen[:-1]
+    known = np.flatnonzero(both.any(axis=1))
     if not len(known):
         return np.zeros_like(paths[:, 0])
-    speeds = np.stack([np.interp(np.arange(len(speeds)), known, speeds[known, k]) for k in range(3)], axis=1)
-    way = np.concatenate([np.zeros((1, 3)), np.cumsum(speeds * lapses[:, None], axis=0)])
+    speeds = np.array([(paths[t + 1, both[t]] - paths[t, both[t]]).mean(axis=0) / lapses[t] for t in known], np.float64)
+    filled = np.stack([np.interp(np.arange(len(lapses)), known, axis) for axis in speeds.T], axis=1)
+    way = np.concatenate([np.zeros((1, 3)), np.cumsum(filled * lapses[:, None], axis=0)])
     return (way - way[len(way) // 2]).astype(np.float32)
 
 

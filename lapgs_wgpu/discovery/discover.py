@@ -93,17 +93,8 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
     are any, and a field that moves the latter. It moves from the first step on. The rates rise first: Adam's first
     steps, all of the size of the rate, would shake off what the field knows.
 
-    Args:
-        config: resolved for the dataset.
-        dataset: the capture.
-        device: that trains.
-        own_field: of Scene4D.
-
-    Returns:
-        The start of the training. The same configuration and capture give the same one.
-
-    Raises:
-        InputError: the images show nothing at all.
+    config: resolved for the dataset. own_field: of Scene4D. The same configuration and capture give the same start.
+    Raises InputError where the images show nothing at all.
     """
     started = time.perf_counter()
     generator = torch.Generator().manual_seed(config.seed)
