@@ -57,13 +57,11 @@ def fit_field(
         return None
     if (fades or light) and (head := getattr(field, "appearance", None)) is not None:  # outputs in that unit
         own = set(head.parameters())
-        groups = [(rate, [each for each in parameters if each not in own]) for rate, parameters in groups]
+        groups = [(rate, [one for one in each if one not in own]) for rate, each in groups]
         groups.append((MLP_RATE / APPEARANCE_SCALE, list(head.parameters())))
     if fades and isinstance(field, GridField) and field.config.dynamics_size > 1 and field.config.temporal_hash:
         _tell_times(field, generator)
-    optimizer = torch.optim.Adam(
-        [{"params": parameters, "lr": rate} for rate, parameters in groups], eps=ADAM_EPS, fused=True
-    )
+    optimizer = torch.optim.Adam([{"params": each, "lr": rate} for rate, each in groups], eps=ADAM_EPS, fused=True)
     paths, supported = torch.from_numpy(tracks.paths), torch.from_numpy(tracks.supported)
     beside = torch.from_numpy(ndimage.maximum_filter1d(tracks.supported, 3, axis=0)).float()
     canonical, codes = scene.parameters["means"].detach(), scene.parameters.get("dynamics")

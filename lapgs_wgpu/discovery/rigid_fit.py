@@ -51,12 +51,9 @@ def rigid_tracks(
     soft_paths, soft_colors = torch.from_numpy(tracks.paths[:, others]), torch.from_numpy(tracks.colors[others])
     count = len(parts) * POINTS
     points = torch.from_numpy(directions(POINTS)).float() * radii[:, None, None]
-    size = torch.log(SPACING * (4 * np.pi / POINTS) ** 0.5 * radii)[:, None].repeat(1, POINTS).ravel()
-    soft_size = torch.full((int(others.sum()),), float(size.mean()))
-    around = {
-        name: torch.from_numpy(parabolas(times, np.ones(len(times)), spread)).float()
-        for name, spread in SPREADS.items()
-    }
+    size = torch.log(SPACING * (4 * np.pi / POINTS) ** 0.5 * radii).repeat_interleave(POINTS)
+    soft_size = torch.full((len(soft_colors),), float(size.mean()))
+    around = {name: torch.from_numpy(parabolas(times, 1.0, spread)).float() for name, spread in SPREADS.items()}
     values = {
         "points": points,
         "colors": torch.cat([torch.full((count, 3), 0.4), soft_colors]),

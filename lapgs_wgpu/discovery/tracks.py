@@ -222,7 +222,7 @@ def _steady(tracks: Tracks, paths: Floats, explained: NDArray[np.int64], half_si
     return steady
 
 
-def parabolas(times: NDArray[np.float64], weights: NDArray[np.float64], spread: float) -> NDArray[np.floating]:
+def parabolas(times: NDArray[np.float64], weights: NDArray[np.float64] | float, spread: float) -> NDArray[np.floating]:
     """(T, T) what turns values at the times (T,) into those of the parabolas fitted around each, by weights (T,) of
     the values and by a Gaussian of this standard deviation, time steps."""
     clock = times / time_step(times)

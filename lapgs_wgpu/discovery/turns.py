@@ -82,7 +82,7 @@ def find_turns(
     middles, sizes = np.stack([centers[k] for k in things], axis=1), radii[things]
     for _ in range(OUTLINES):
         middles, sizes = _outlined(times, middles, sizes, images)
-    clock, near = times / time_step(times), parabolas(times, np.ones(len(times)), SPREAD)
+    clock, near = times / time_step(times), parabolas(times, 1.0, SPREAD)
     found = {}
     for n, k in enumerate(things.tolist()):
         looks = _looks(n, times, middles, sizes, images)
