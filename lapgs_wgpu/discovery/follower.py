@@ -88,8 +88,7 @@ class Follower:
         for i in sorted(range(len(times)), key=lambda i: (abs(i - key), i))[1:]:
             side = 1 if i > key else -1
             known = (past[-side][:0:-1] + past[side])[-MEMORY:]
-            start = self._predict(times[known], paths[known], times[i])
-            paths[i] = self._register(start, i, first=len(past[side]) == 1)
+            paths[i] = self._register(self._predict(times[known], paths[known], times[i]), i)
             past[side].append(i)
         return paths
 
@@ -112,16 +111,15 @@ class Follower:
             positions[part.members] += step * min(1.0, longest / max(float(np.linalg.norm(step)), 1e-9))
         return positions
 
-    def _register(self, start: Floats, i: int, *, first: bool) -> Floats:
-        """Positions (n, 3) of the tracks' points among the points of time i, from a prediction and from where the
-        parts' centers are expected."""
+    def _register(self, positions: Floats, i: int) -> Floats:
+        """Positions (n, 3) of the tracks' points among the points of time i, from a prediction, which is changed, and
+        from where the parts' centers are expected."""
         points = self._clouds.clouds[i].thinned(DATA)
-        positions = start.copy()
         if len(points.scores) == 0:
             return positions
         free = np.ones(len(points.scores), np.float32)
         for part in self._parts:
-            free *= 1.0 - 0.9 * self._search(part, positions, points, free, i, first=first)
+            free *= 1.0 - 0.9 * self._search(part, positions, points, free, i)
         data, weights = points.positions, points.scores[:, None]
         alike = 0.2 + 0.8 * np.exp(-_sq_distances(points.colors, self.colors) / (2 * COLOR_SPREAD**2))
         for step in range(ROUNDS):
@@ -134,11 +132,11 @@ class Follower:
             positions = positions + (kernel @ (belongs.T @ data - mass * positions)) / (kernel @ mass + 1e-2)
         return positions
 
-    def _search(self, part: _Part, positions: Floats, points: Points, free: Floats, i: int, *, first: bool) -> Floats:
+    def _search(self, part: _Part, positions: Floats, points: Points, free: Floats, i: int) -> Floats:
         """Shift a part in `positions` to where it explains most of the points of time i, around where it is and around
         where its center is expected; (m,) how well it explains each point there."""
         widening = min(max(1.0, FAST * part.speed / (SEARCH * self._unit)), 2.0)
-        reach = 1.5 if first else widening + 0.25 * min(part.lost, 4)
+        reach = 1.5 if abs(i - self._key) == 1 else widening + 0.25 * min(part.lost, 4)
         starts = [np.zeros(3, np.float32)]
         if part.expected is not None:
             starts.append(part.expected[i] - positions[part.members].mean(axis=0))

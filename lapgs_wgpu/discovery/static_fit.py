@@ -100,8 +100,8 @@ def static_fit(config: Config, dataset: Dataset, device: Device, progress: Calla
             depths.append(depth_of(training.scene, camera))
     corrections = None
     if refinement is not None:
-        cameras = {before.camera: after.camera for before, after in zip(picked, small, strict=True)}
-        corrections = {camera: refinement.correction(fitted) for camera, fitted in cameras.items()}
+        pairs = zip(picked, small, strict=True)
+        corrections = {before.camera: refinement.correction(after.camera) for before, after in pairs}
     return StaticFit(training.scene, images, depths or None, corrections)
 
 

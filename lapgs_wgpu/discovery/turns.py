@@ -225,10 +225,8 @@ def _turn_at(looks: list[_Look], clock: Doubles, key: int) -> tuple[Doubles, flo
 def _turns(looks: list[_Look], clock: Doubles) -> Doubles:
     """(T, 3, 3) rotations of a part, from the key time at which a turn explains most. clock: (T,) time steps."""
     seen = np.flatnonzero([len(look.places) for look in looks])
-    keys = np.unique(seen[np.linspace(0, len(seen) - 1, KEYS + 2).round().astype(int)[1:-1]])
-    found = [_turn_at(looks, clock, int(key)) for key in keys]
-    best = int(np.argmax([gain for _, gain in found]))
-    key, turn = int(keys[best]), found[best][0]
+    keys = np.unique(seen[evenly_indices(len(seen), KEYS + 2)[1:-1]]).tolist()
+    turn, _, key = max(((*_turn_at(looks, clock, key), key) for key in keys), key=lambda found: found[1])
     lapses = clock - clock[key]
     R = Rotation.from_rotvec(lapses[:, None] * turn).as_matrix()
     known = np.zeros((4, SIDE, SIDE, SIDE))
