@@ -29,11 +29,8 @@ NEAR = 0.1  # box half sides; distance within which a track explains a surface p
 
 
 def rows_with(static: Scene4D, tracks: Tracks, *, sheets: bool = False) -> dict[str, Tensor]:
-    """The Gaussians of the static fit, then one for each track at its place at the key time.
-
-    sheets: whether each part is a sheet of its own, which nothing lies behind. They are the parameters of a scene
-    without a field, float32.
-    """
+    """The Gaussians of the static fit, then one for each track at its place at the key time: the parameters of a scene
+    without a field, float32. sheets: whether each part is a sheet of its own, which nothing lies behind."""
     scale, opacity = (SHEET_SCALE, SHEET_OPACITY) if sheets else (SCALE, OPACITY)
     apart = tracks.part if sheets else np.zeros_like(tracks.part)
     scales = np.empty(len(apart), np.float32)

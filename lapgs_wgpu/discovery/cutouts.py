@@ -101,10 +101,8 @@ def cutout_tracks(
 
 
 def _show_nearest(cutouts: Sequence[_Cutout], seen: Mask) -> None:
-    """Have each image show the cut-outs of the nearest images: what a nearer one explains is not shown twice.
-
-    seen: (T, cut-outs), which becomes False where they are not shown.
-    """
+    """Have each image show the cut-outs of the nearest images, and none where a nearer one explains the same: there
+    seen (T, cut-outs) becomes False."""
     for t in range(len(seen)):
         known = np.zeros_like(cutouts[0].explained[t])
         for k in np.argsort([abs(cutout.key - t) for cutout in cutouts], kind="stable"):
@@ -143,6 +141,7 @@ def _followed(levels: Sequence[list[Floats]], masks: Mask, key: int, pixels: NDA
     maps, seen = np.tile(np.eye(2, 3), (len(masks), 1, 1)), np.zeros(len(masks), bool)
     explained = np.zeros_like(masks)
     seen[key] = explained[key, pixels[:, 1], pixels[:, 0]] = True
+    near = ndimage.binary_dilation(explained[key]).astype(np.float32)
     for way in (-1, 1):
         before, step = np.eye(2, 3), np.zeros((2, 3))
         for at in range(key + way, len(masks) if way > 0 else -1, way):
@@ -154,20 +153,18 @@ def _followed(levels: Sequence[list[Floats]], masks: Mask, key: int, pixels: NDA
                 break
             maps[at], seen[at] = found, True
             step, before = found - before, found
-            explained[at] = _explained(levels[key], levels[at], masks[at], pixels, found)
+            explained[at] = _explained(levels[key], levels[at], masks[at], near, found)
     return _Cutout(key, pixels, maps, seen, explained)
 
 
-def _registered(source: list[Floats], target: list[Floats], pixels: NDArray[np.int64], start: Map) -> tuple[Map, float]:
-    """The map (2, 3) of a cut-out's pixels to another image, and the share of them that look alike there."""
+def _registered(source: list[Floats], target: list[Floats], pixels: NDArray[np.int64], M: Map) -> tuple[Map, float]:
+    """The map (2, 3) of a cut-out's pixels to another image, near M, and the share of them that look alike there."""
     chosen = pixels[evenly_indices(len(pixels), PIXELS)]
     x, y = chosen.T
     middle = chosen.mean(axis=0)
     scale = max(float(chosen.std()), 1.0)
-    u, v = ((chosen - middle) / scale).T
-    M = start.copy()
+    basis = np.column_stack([(chosen - middle) / scale, np.ones(len(chosen))])
     height, width = source[0].shape[:2]
-    basis = np.stack([u, v, np.ones_like(u)], axis=1)
     for there, here in zip(target, source, strict=True):
         wanted = here[y, x, :4]
         for _ in range(ITERATIONS):
@@ -202,14 +199,13 @@ def _sampled(planes: Floats, at: NDArray[np.float64]) -> Floats:
     return above * (1 - b) + below * b
 
 
-def _explained(source: list[Floats], target: list[Floats], mask: Mask, pixels: NDArray[np.int64], M: Map) -> Mask:
-    """(H, W) the moving pixels of another image that look like those of the cut-out that a map takes there."""
-    cut, result = np.zeros_like(mask), np.zeros_like(mask)
-    cut[pixels[:, 1], pixels[:, 0]] = True
+def _explained(source: list[Floats], target: list[Floats], mask: Mask, near: Floats, M: Map) -> Mask:
+    """(H, W) the moving pixels of another image that look like those of the cut-out that a map takes there. near:
+    (H, W) 1 in the cut-out and beside it, else 0."""
+    result = np.zeros_like(mask)
     rows, columns = np.nonzero(mask)
     back = np.linalg.inv(M[:, :2]) @ (np.stack([columns, rows]) - M[:, 2:])
-    near = ndimage.binary_dilation(cut)
-    inside = ndimage.map_coordinates(near.astype(np.float32), back[::-1], order=0) > 0
+    inside = ndimage.map_coordinates(near, back[::-1], order=0) > 0
     alike = np.abs(_sampled(source[1][..., :3], back) - target[1][rows, columns, :3]).max(axis=1) < ALIKE
     result[rows, columns] = inside & alike
     return result

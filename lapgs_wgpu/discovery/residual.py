@@ -25,17 +25,10 @@ def cubic_grid(axis: NDArray[Any]) -> NDArray[Any]:
 
 
 class Residual:
-    """A training image and its moving pixels.
+    """A training image at a time in [0, 1], and its moving pixels, the attribute mask (H, W).
 
-    Args:
-        camera: of the image.
-        time: in [0, 1].
-        image: (H, W, 3) in [0, 1].
-        still: (H, W, 3), the static fit's image of the same camera.
-        moving: (H, W), the moving pixels as masks tell them, which are completed; None to find them.
-
-    Attributes:
-        mask: (H, W), the moving pixels.
+    image: (H, W, 3) in [0, 1]. still: the same by the static fit. moving: (H, W), the moving pixels as masks tell them,
+    which are completed; None to find them.
     """
 
     def __init__(self, camera: Camera, time: float, image: Floats, still: Floats, moving: Mask | None = None) -> None:
@@ -82,9 +75,8 @@ class Residual:
     def rays(self, most: int) -> tuple[Floats, Floats, Floats]:
         """Of at most `most` moving pixels, evenly chosen, the directions (n, 3) of depth 1, the blurred colors (n, 3),
         and their own (n, 3)."""
-        rows, columns = np.nonzero(self.mask)
-        chosen = evenly_indices(len(rows), most)
-        rows, columns = rows[chosen], columns[chosen]
+        places = np.argwhere(self.mask)
+        rows, columns = places[evenly_indices(len(places), most)].T
         K = self.camera.K
         u, v = (columns + 0.5 - K[0, 2]) / K[0, 0], (rows + 0.5 - K[1, 2]) / K[1, 1]
         directions = np.stack([u, v, np.ones(len(rows))], axis=1) @ self.camera.T_cam_world[:3, :3]

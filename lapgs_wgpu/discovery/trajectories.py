@@ -49,11 +49,8 @@ class Trajectory(NamedTuple):
 
 
 class _Groups(NamedTuple):
-    """The groups of all times.
-
-    clock: (T,) all times, in typical time steps. half_side: of the box. Of each group time: (n,) its index. centers,
-    colors: (n, 3). worth: (n,) in [0, 1].
-    """
+    """The groups of all times. clock: (T,) these, in typical time steps. half_side: of the box. time: (n,) the index of
+    each group's. centers, colors: (n, 3). worth: (n,) in [0, 1]."""
 
     clock: NDArray[np.float64]
     half_side: float
