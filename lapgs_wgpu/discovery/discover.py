@@ -100,17 +100,17 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
     generator = torch.Generator().manual_seed(config.seed)
     found = _in_hull(config, dataset, device) if dataset.is_surrounded else None
     found = found or _in_residuals(config, dataset, device, generator)
-    static, tracks, times, share, origin, light, sheets, corrections = found
-    scene = scene_with(static, tracks, config, generator, own_field, sheets=sheets)
+    tracks, share, light, sheets = found.tracks, found.share, found.light, found.sheets
+    scene = _scene_with(found, config, generator, own_field)
     field_fitted, summary = 0.0, f"{share:.1%} of what it lacks can be followed: nothing is added"
     if tracks is not None:
         steps, parts = config.discovery.field_steps, len(np.unique(tracks.part))
         meter = Progress(steps, "steps of motion discovery, part 2 of 2: what moves")
-        error = fit_field(scene, tracks, times, steps, generator, meter.at, fades=sheets, light=light)
+        error = fit_field(scene, tracks, found.times, steps, generator, meter.at, fades=sheets, light=light)
         meter.clear()
         if error is None:
             summary = "the field cannot move what it lacks: nothing is added"
-            scene = scene_with(static, None, config, generator, own_field, sheets=False)
+            scene = _scene_with(found._replace(tracks=None), config, generator, own_field)
         else:
             summary = (
                 f"{parts} moving parts with {len(tracks.part)} Gaussians, {share:.0%} of what it lacks, followed "
@@ -125,8 +125,8 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
         scene,
         ramp_steps=config.schedule.warm_up or RAMP_STEPS,
         field_fitted=field_fitted,
-        corrections=corrections,
-        summary=f"{origin} of {len(static)} Gaussians; {summary}",
+        corrections=found.corrections,
+        summary=f"{found.origin} of {len(found.static)} Gaussians; {summary}",
         seconds=time.perf_counter() - started,
     )
 
@@ -194,22 +194,15 @@ def _in_residuals(config: Config, dataset: Dataset, device: Device, generator: t
     return _Found(static, tracks, times, share, "a static fit", light, depths is not None, corrections)
 
 
-def scene_with(
-    static: Scene4D,
-    tracks: Tracks | None,
-    config: Config,
-    generator: torch.Generator,
-    own_field: nn.Module | None,
-    *,
-    sheets: bool,
-) -> Scene4D:
+def _scene_with(found: _Found, config: Config, generator: torch.Generator, own_field: nn.Module | None) -> Scene4D:
     """The Gaussians of what stands still, then one for each track; the field does not move them yet."""
+    static, tracks, size = found.static, found.tracks, config.field.dynamics_size
     rows: dict[str, Tensor] = dict(static.parameters)
-    dynamics = torch.zeros(len(static), config.field.dynamics_size)
+    dynamics = torch.zeros(len(static), size)
     if tracks is not None:
-        rows = rows_with(static, tracks, sheets=sheets)
-        of_part = DYNAMICS * torch.randn(tracks.parts, config.field.dynamics_size, generator=generator)
-        if sheets and config.field.dynamics_size > 1:  # shown one after another, which the field can tell by these
+        rows = rows_with(static, tracks, sheets=found.sheets)
+        of_part = DYNAMICS * torch.randn(tracks.parts, size, generator=generator)
+        if found.sheets and size > 1:  # shown one after another, which the field can tell by these
             when = [tracks.supported[:, tracks.part == k].mean(axis=1) for k in range(len(of_part))]
             middle = np.array([np.average(np.linspace(-1, 1, len(each)), weights=each) for each in when])
             of_part[:, :2] = torch.from_numpy(np.stack([np.ones_like(middle), middle], axis=1)) * SHEET_DYNAMICS

@@ -134,7 +134,7 @@ def fit_field(
 
 
 def _tell_times(field: GridField, generator: torch.Generator) -> None:
-    """Have the decoder's units begin as hinges in time and in the time of a sheet's code (`discover.scene_with`): what
+    """Have the decoder's units begin as hinges in time and in the time of a sheet's code (`discover`): what
     moves and fades one after another is made of these. Without a code, as what stands still is, all are zero."""
     with torch.no_grad():
         for grid in field.grids[1:]:
