@@ -55,36 +55,22 @@ def tracks_in_images(
     each time. Their depths then agree whatever moves, and a part that brings the static fit nearer to the images is
     kept, too.
     """
-    judges = evenly(images, IMAGES)
-    parts = (tracks.rows(tracks.part == k) for k in range(tracks.parts))
-    shares = [_shares(part, times, judges, static, background) for part in parts]
-    return tracks.of_parts(np.array([moving >= MOVING or (together and gain >= GAIN) for moving, gain in shares]))
-
-
-def _shares(
-    part: Tracks, times: NDArray[np.float64], images: Sequence[Residual], static: Scene4D, background: float
-) -> tuple[float, float]:
-    """Of the pixels in which a part shows, those that move; and of the static fit's error there (sum of absolute
-    differences), what it takes away."""
-    scene = Scene4D(
-        rows_with(static, part),
-        static.field_config,
-        static.device,
-        sh_degree=static.sh_degree,
-        antialiased=static.antialiased,
-    )
-    level = torch.full((3,), background)
-    pixels, moving, before, after = 0, 0, 0.0, 0.0
-    for image in images:
-        with torch.no_grad():
-            path = torch.from_numpy(part.paths[np.searchsorted(times, image.time)])
-            scene.parameters["means"][len(static) :] = path
+    kept, level = np.zeros(tracks.parts, bool), torch.full((3,), background)
+    for k in range(len(kept)):
+        part = tracks.rows(tracks.part == k)
+        scene = Scene4D(rows_with(static, part), static.field_config, static.device, sh_degree=static.sh_degree)
+        scene.antialiased = static.antialiased
+        means, sums = scene.parameters["means"].detach()[len(static) :], np.zeros(4)
+        for image in evenly(images, IMAGES):
+            means[:] = torch.from_numpy(part.paths[np.searchsorted(times, image.time)])
             rendered = scene.render(image.camera, image.time, level, depth=False).image.numpy(force=True)
-        shows = np.abs(rendered - image.still).max(axis=2) > CHANGED
-        pixels, moving = pixels + int(shows.sum()), moving + int((shows & image.mask).sum())
-        before += float(np.abs(image.still - image.image)[shows].sum())
-        after += float(np.abs(rendered - image.image)[shows].sum())
-    return moving / max(pixels, 1), 1.0 - after / max(before, 1e-6)
+            shows = np.abs(rendered - image.still).max(axis=2) > CHANGED
+            errors = (np.abs(each - image.image)[shows].sum() for each in (image.still, rendered))
+            sums += shows.sum(), (shows & image.mask).sum(), *errors
+        pixels, moving, before, after = sums
+        gain = 1.0 - after / max(before, 1e-6)
+        kept[k] = moving / max(pixels, 1) >= MOVING or (together and gain >= GAIN)
+    return tracks.of_parts(kept)
 
 
 def explained_share(clouds: PointClouds, tracks: Tracks | None) -> float:
