@@ -118,12 +118,11 @@ def _show_nearest(cutouts: Sequence[_Cutout], seen: Mask) -> None:
 def _common_way(paths: Floats, seen: Mask, times: NDArray[np.float64]) -> Floats:
     """(T, 3) how far all tracks have moved on average since half of the clip: where none is seen at two times one after
     another, as fast as before and after."""
-    lapses = np.diff(times)
-    both = seen[1:] & seen[:-1]
+    lapses, steps, both = np.diff(times), np.diff(paths, axis=0), seen[1:] & seen[:-1]
     known = np.flatnonzero(both.any(axis=1))
     if not len(known):
         return np.zeros_like(paths[:, 0])
-    speeds = np.array([(paths[t + 1, both[t]] - paths[t, both[t]]).mean(axis=0) / lapses[t] for t in known], np.float64)
+    speeds = np.array([steps[t, both[t]].mean(axis=0) / lapses[t] for t in known], np.float64)
     filled = np.stack([np.interp(np.arange(len(lapses)), known, axis) for axis in speeds.T], axis=1)
     way = np.concatenate([np.zeros((1, 3)), np.cumsum(filled * lapses[:, None], axis=0)])
     return (way - way[len(way) // 2]).astype(np.float32)

@@ -84,12 +84,10 @@ class Follower:
         key, times = self._key, self._clouds.times
         paths = np.zeros((len(times), *self.positions.shape), np.float32)
         paths[key] = self.positions
-        past: dict[int, list[int]] = {1: [key], -1: [key]}  # times in the order in which a side was followed
-        for i in sorted(range(len(times)), key=lambda i: (abs(i - key), i))[1:]:
-            side = 1 if i > key else -1
-            known = (past[-side][:0:-1] + past[side])[-MEMORY:]
+        order = sorted(range(len(times)), key=lambda i: (abs(i - key), i))
+        for n, i in enumerate(order[1:], start=1):
+            known = sorted(order[:n], key=lambda j: -abs(j - i))[-MEMORY:]  # all lie on one side of it
             paths[i] = self._register(self._predict(times[known], paths[known], times[i]), i)
-            past[side].append(i)
         return paths
 
     def _predict(self, times: NDArray[np.float64], paths: Floats, t: float) -> Floats:

@@ -114,7 +114,7 @@ def _points(image: Residual, neighbors: list[tuple[Residual, float]], always: Fl
     votes, tolerant, weights = np.zeros((3, *depths.shape))
     most = 0.0
     for neighbor, lapse in neighbors:
-        weight = 1.0 / (1.0 + lapse**2)  # half a time step away
+        weight = 1.0 / (1.0 + lapse**2)  # a half at one time step
         mask, shown, inside = neighbor.sample(places)
         sq_distances = ((shown - blurred[:, None]) ** 2).sum(axis=2)
         agreement = 1.0 - COLOR_SHARE + COLOR_SHARE * np.exp(-sq_distances / (2 * COLOR_SPREAD**2))
