@@ -97,8 +97,7 @@ def fit_field(
         samples = TimeSamples(torch.arange(len(means)), tuple(others)) if others else None
         for at, move in zip(now, field.at_times(means, first_time, dynamics, time_samples=samples), strict=True):
             seen, targets = supported[at, asked], paths[at, asked].lerp(paths[at, other], way)
-            moved = move.apply_to_means(means)
-            squared = (moved - torch.cat([targets, means[len(asked) :]])).square().sum(dim=1)
+            squared = (move.apply_to_means(means) - torch.cat([targets, means[len(asked) :]])).square().sum(dim=1)
             far = (squared + SOFTENING**2).sqrt()
             if fades:  # few are seen at a time; between two times, those of both
                 weights = HIDDEN + (1 - HIDDEN) * beside[at, asked]

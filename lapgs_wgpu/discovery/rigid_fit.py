@@ -50,12 +50,11 @@ def rigid_tracks(
     centers = torch.from_numpy(np.stack([tracks.center(k) for k in parts], axis=1))
     soft_paths, soft_colors = torch.from_numpy(tracks.paths[:, others]), torch.from_numpy(tracks.colors[others])
     count = len(parts) * POINTS
-    points = torch.from_numpy(directions(POINTS)).float() * radii[:, None, None]
     size = torch.log(SPACING * (4 * np.pi / POINTS) ** 0.5 * radii).repeat_interleave(POINTS)
     soft_size = torch.full((len(soft_colors),), float(size.mean()))
     around = {name: torch.from_numpy(parabolas(times, 1.0, spread)).float() for name, spread in SPREADS.items()}
     values = {
-        "points": points,
+        "points": torch.from_numpy(directions(POINTS)).float() * radii[:, None, None],
         "colors": torch.cat([torch.full((count, 3), 0.4), soft_colors]),
         "sizes": torch.cat([size, soft_size]),
         "opacities": torch.full((count + len(soft_size),), OPACITY),

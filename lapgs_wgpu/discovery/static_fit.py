@@ -88,8 +88,7 @@ def static_fit(config: Config, dataset: Dataset, device: Device, progress: Calla
     for view in small:
         image = (composite(view.load(), background.numpy()) / 255).astype(np.float32)
         camera = view.camera if refinement is None else refinement.refined(view.camera)
-        rendering = training.scene.render(camera, view.time, background, depth=False)
-        still = rendering.image.numpy(force=True)
+        still = training.scene.render(camera, view.time, background, depth=False).image.numpy(force=True)
         if (correction := training.exposure_of(view)) is not None:
             image = without_exposure(image, correction.numpy(force=True))
         if (ignored := view.load_ignored()) is not None:

@@ -122,7 +122,11 @@ def _points(image: Residual, neighbors: list[tuple[Residual, float]], always: Fl
         votes += vote
         # Standard deviation of the depths at which things seem to be that move while the camera goes to the neighbor.
         parallax = float(np.linalg.norm(neighbor.camera.position - eye)) / max(float(np.linalg.norm(eye)), 1e-6)
-        tolerant += _blur_along_rays(vote, MOTION * half_side * lapse / max(parallax, 1e-6) / spacing)
+        spread = MOTION * half_side * lapse / max(parallax, 1e-6) / spacing
+        if spread > DEPTHS:
+            tolerant += vote.mean(axis=1, keepdims=True)
+        else:
+            tolerant += ndimage.gaussian_filter1d(vote, max(spread, 0.1), axis=1, mode="nearest", truncate=3.0)
         weights += weight * inside
         most += weight
     at = np.moveaxis((places / half_side + 1) * 0.5 * GRID - 0.5, -1, 0)
@@ -137,13 +141,6 @@ def _points(image: Residual, neighbors: list[tuple[Residual, float]], always: Fl
     positions = eye + depth[:, None] * directions
     best = scores.max(axis=1)
     return Points(positions.astype(np.float32), colors, best.astype(np.float32)).chosen(best > LEAST_SCORE)
-
-
-def _blur_along_rays(votes: NDArray[np.floating], spread: float) -> NDArray[np.floating]:
-    """Votes (n, DEPTHS) along each ray, blurred by a Gaussian of this standard deviation, in depths."""
-    if spread > DEPTHS:
-        return np.broadcast_to(votes.mean(axis=1, keepdims=True), votes.shape)
-    return ndimage.gaussian_filter1d(votes, max(spread, 0.1), axis=1, mode="nearest", truncate=3.0)
 
 
 def _depths(eye: Floats, directions: Floats, half_side: float) -> Floats:

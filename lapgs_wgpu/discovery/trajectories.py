@@ -1,13 +1,11 @@
 """Trajectories: where groups of surface points go over the whole clip, as far as their centers tell.
 
-The points of a time form groups. Dynamic programming links the groups of all times to the path that explains most of
-them and bends least; the groups on it are then worth less, and the next path is looked for. A path may leap over times
-at which nothing is seen, and may turn sharply a few times. What follows parts step by step (`tracks`) takes the
-trajectories as a second opinion, since it goes astray where things are fast, hidden, or turn sharply.
+Dynamic programming links the groups of points of all times to the path that explains most of them and bends least;
+its groups are then worth less, and the next path is looked for. A path may leap over times at which nothing is seen,
+and may turn sharply a few times. `tracks` takes it as a second opinion where things are fast, hidden, or turn sharply.
 
-Paths that were found one after another share groups, and change over where things meet. So as many paths as there
-usually are groups are given the groups of each time at once, one to one, and paths that meet part in the way in which
-they bend least; so do all across a gap between the images, in which things may have gone anywhere.
+Such paths share groups, and change over where things meet. So as many paths as there usually are groups are given the
+groups of each time at once, one to one; those that meet, and all across a gap between the images, bend least.
 """
 
 from itertools import combinations
