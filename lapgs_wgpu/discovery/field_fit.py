@@ -88,9 +88,8 @@ def fit_field(
             along, way = torch.rand(2, len(asked), 1, generator=generator)
             other = first[asked] + (along[:, 0] * count[asked]).long()
             way = way * (WITHIN + BEYOND) - BEYOND
-        rows = torch.cat([still + asked, staying])
         means = torch.cat([canonical[still + asked].lerp(canonical[still + other], way), canonical[staying]])
-        dynamics = None if codes is None else codes.detach()[rows]
+        dynamics = None if codes is None else codes.detach()[torch.cat([still + asked, staying])]
         sizes = [len(asked), len(staying)]
         loss, distance = torch.zeros(()), 0.0
         first_time, *others = (float(times[at]) for at in now)
