@@ -119,7 +119,7 @@ def _common_way(paths: Floats, seen: Mask, times: NDArray[np.float64]) -> Floats
     """(T, 3) how far all tracks have moved on average since half of the clip: where none is seen at two times one after
     another, as fast as before and after."""
     lapses, steps, both = np.diff(times), np.diff(paths, axis=0), seen[1:] & seen[:-1]
-    known = np.flatnonzero(both.any(axis=1))
+    known = np.flatnonzero(both.any(axis=1) & (lapses > 0))
     if not len(known):
         return np.zeros_like(paths[:, 0])
     speeds = np.array([steps[t, both[t]].mean(axis=0) / lapses[t] for t in known], np.float64)
@@ -247,7 +247,7 @@ def _placed(cutout: _Cutout, images: Sequence[Residual], depths: Sequence[Floats
         column, row = np.rint(at[t]).astype(np.int64).clip(0, [[width - 1], [height - 1]])
         near = depths[t][row, column]
         if np.isfinite(near).any():
-            inverse[t] = 1 / float(np.nanmedian(near))
+            inverse[t] = np.float64(1.0) / np.nanmedian(near)
     depth = np.ones(len(images))
     if inverse:  # nearly a line over a few times
         filled = np.interp(np.arange(len(images)), list(inverse), list(inverse.values()))
