@@ -29,18 +29,14 @@ NEAR = 0.1  # box half sides; distance within which a track explains a surface p
 
 
 def rows_with(static: Scene4D, tracks: Tracks, *, sheets: bool = False) -> dict[str, Tensor]:
-    """The Gaussians of the static fit, then one for each track at its place at the key time.
-
-    sheets: whether each part is a sheet of its own, which nothing lies behind. They are the parameters of a scene
-    without a field, float32.
-    """
-    if sheets:
-        scales = np.empty(len(tracks.part), np.float32)
-        for part in np.unique(tracks.part):
-            scales[tracks.part == part] = SHEET_SCALE * initial_scales(tracks.positions[tracks.part == part])
-    else:
-        scales = SCALE * initial_scales(tracks.positions)
-    new = isotropic_rows(tracks.positions, tracks.colors, scales, SHEET_OPACITY if sheets else OPACITY)
+    """The Gaussians of the static fit, then one for each track at its place at the key time: the parameters of a scene
+    without a field, float32. sheets: whether each part is a sheet of its own, which nothing lies behind."""
+    scale, opacity = (SHEET_SCALE, SHEET_OPACITY) if sheets else (SCALE, OPACITY)
+    apart = tracks.part if sheets else np.zeros_like(tracks.part)
+    scales = np.empty(len(apart), np.float32)
+    for k in np.unique(apart):
+        scales[apart == k] = scale * initial_scales(tracks.positions[apart == k])
+    new = isotropic_rows(tracks.positions, tracks.colors, scales, opacity)
     return {name: torch.cat([static.parameters[name].detach(), values]) for name, values in new.items()}
 
 
@@ -59,38 +55,22 @@ def tracks_in_images(
     each time. Their depths then agree whatever moves, and a part that brings the static fit nearer to the images is
     kept, too.
     """
-    judges = evenly(images, IMAGES)
-    kept = np.zeros(tracks.parts, bool)
+    kept, level = np.zeros(tracks.parts, bool), torch.full((3,), background)
     for k in range(len(kept)):
-        moving, gain = _shares(tracks.rows(tracks.part == k), times, judges, static, background)
-        kept[k] = moving >= MOVING or (together and gain >= GAIN)
-    return tracks.of_parts(kept)
-
-
-def _shares(
-    part: Tracks, times: NDArray[np.float64], images: Sequence[Residual], static: Scene4D, background: float
-) -> tuple[float, float]:
-    """Of the pixels in which a part shows, those that move; and of the static fit's error there (sum of absolute
-    differences), what it takes away."""
-    scene = Scene4D(
-        rows_with(static, part),
-        static.field_config,
-        static.device,
-        sh_degree=static.sh_degree,
-        antialiased=static.antialiased,
-    )
-    level = torch.full((3,), background)
-    pixels, moving, before, after = 0, 0, 0.0, 0.0
-    for image in images:
-        with torch.no_grad():
-            path = torch.from_numpy(part.paths[np.searchsorted(times, image.time)])
-            scene.parameters["means"][len(static) :] = path
+        part = tracks.rows(tracks.part == k)
+        scene = Scene4D(rows_with(static, part), static.field_config, static.device, sh_degree=static.sh_degree)
+        scene.antialiased = static.antialiased
+        means, sums = scene.parameters["means"].detach()[len(static) :], np.zeros(4)
+        for image in evenly(images, IMAGES):
+            means[:] = torch.from_numpy(part.paths[np.searchsorted(times, image.time)])
             rendered = scene.render(image.camera, image.time, level, depth=False).image.numpy(force=True)
-        shows = np.abs(rendered - image.still).max(axis=2) > CHANGED
-        pixels, moving = pixels + int(shows.sum()), moving + int((shows & image.mask).sum())
-        before += float(np.abs(image.still - image.image)[shows].sum())
-        after += float(np.abs(rendered - image.image)[shows].sum())
-    return moving / max(pixels, 1), 1.0 - after / max(before, 1e-6)
+            shows = np.abs(rendered - image.still).max(axis=2) > CHANGED
+            errors = (np.abs(each - image.image)[shows].sum() for each in (image.still, rendered))
+            sums += shows.sum(), (shows & image.mask).sum(), *errors
+        pixels, moving, before, after = sums
+        gain = 1.0 - after / max(before, 1e-6)
+        kept[k] = moving / max(pixels, 1) >= MOVING or (together and gain >= GAIN)
+    return tracks.of_parts(kept)
 
 
 def explained_share(clouds: PointClouds, tracks: Tracks | None) -> float:

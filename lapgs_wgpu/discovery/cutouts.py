@@ -64,49 +64,45 @@ def cutout_tracks(
     """
     levels = [_levels(each) for each in residuals]
     masks = np.stack([each.mask for each in residuals])
-    known, least = np.zeros_like(masks), LEAST * masks[0].size
+    rest, least = masks.copy(), LEAST * masks[0].size
     cutouts: list[_Cutout] = []
-    rest = masks.sum(axis=(1, 2))
-    enough = np.maximum(ENOUGH * rest, least)
-    while len(cutouts) < MOST and (rest > enough).any():
-        key = int(np.argmax(rest))
+    sizes = masks.sum(axis=(1, 2))
+    enough = np.maximum(ENOUGH * sizes, least)
+    while len(cutouts) < MOST and (sizes > enough).any():
+        key = int(np.argmax(sizes))
         labels, count = ndimage.label(ndimage.binary_opening(masks[key]))
         for label in range(1, count + 1):
             part = labels == label
-            if (part & ~known[key]).sum() > max(ENOUGH * part.sum(), least):
+            if (part & rest[key]).sum() > max(ENOUGH * part.sum(), least):
                 rows, columns = np.nonzero(part)
                 cutouts.append(_followed(levels, masks, key, np.stack([columns, rows], axis=1)))
-                known |= cutouts[-1].explained
+                rest &= ~cutouts[-1].explained
         enough[key] = np.inf
-        rest = np.where(np.isinf(enough), 0, (masks & ~known).sum(axis=(1, 2)))
+        sizes = np.where(np.isinf(enough), 0, rest.sum(axis=(1, 2)))
     if not cutouts:
         return None, 0.0
     ground = [_depths(mask, depth) for mask, depth in zip(masks, depths, strict=True)]
-    parts = [_placed(cutout, residuals, ground, POINTS // len(cutouts)) for cutout in cutouts]
-    number = np.repeat(np.arange(len(parts)), [len(colors) for _, colors in parts])
-    paths = np.concatenate([paths for paths, _ in parts], axis=1)
+    placed = [_placed(cutout, residuals, ground, POINTS // len(cutouts)) for cutout in cutouts]
+    paths, colors = (np.concatenate(each, axis=-2) for each in zip(*placed, strict=True))
+    number = np.repeat(np.arange(len(cutouts)), [len(own) for _, own in placed])
     seen = np.stack([cutout.seen for cutout in cutouts], axis=1)
     way = _common_way(paths, seen[:, number], np.array([each.time for each in residuals]))
     for k in range(len(cutouts)):  # beyond, it goes as all go
-        first, last = np.flatnonzero(seen[:, k])[[0, -1]]
-        own = number == k
-        paths[:first, own] = paths[first, own] + (way[:first] - way[first])[:, None]
-        paths[last + 1 :, own] = paths[last, own] + (way[last + 1 :] - way[last])[:, None]
+        shown, own = np.flatnonzero(seen[:, k]), number == k
+        nearest = np.arange(len(seen)).clip(shown[0], shown[-1])
+        paths[:, own] = paths[np.ix_(nearest, own)] + (way - way[nearest])[:, None]
     _show_nearest(cutouts, seen)
     keys = np.array([cutout.key for cutout in cutouts])
     ahead = np.mean([each.camera.T_cam_world[2, :3] for each in residuals], axis=0).astype(np.float32)
-    apart = np.linspace(*APART, len(parts), dtype=np.float32)[np.argsort(np.argsort(keys))]
+    apart = np.linspace(*APART, len(cutouts), dtype=np.float32)[np.argsort(np.argsort(keys))]
     positions = (paths - way[:, None])[keys[number], np.arange(len(number))]
     positions += half_side * apart[number][:, None] * ahead - positions.mean(axis=0)
-    tracks = Tracks(positions, np.concatenate([colors for _, colors in parts]), number, paths, seen[:, number])
-    return tracks, float((known & masks).sum() / masks.sum())
+    return Tracks(positions, colors, number, paths, seen[:, number]), float((masks & ~rest).sum() / masks.sum())
 
 
 def _show_nearest(cutouts: Sequence[_Cutout], seen: Mask) -> None:
-    """Have each image show the cut-outs of the nearest images: what a nearer one explains is not shown twice.
-
-    seen: (T, cut-outs), which becomes False where they are not shown.
-    """
+    """Have each image show the cut-outs of the nearest images, and none where a nearer one explains the same: there
+    seen (T, cut-outs) becomes False."""
     for t in range(len(seen)):
         known = np.zeros_like(cutouts[0].explained[t])
         for k in np.argsort([abs(cutout.key - t) for cutout in cutouts], kind="stable"):
@@ -122,28 +118,21 @@ def _show_nearest(cutouts: Sequence[_Cutout], seen: Mask) -> None:
 def _common_way(paths: Floats, seen: Mask, times: NDArray[np.float64]) -> Floats:
     """(T, 3) how far all tracks have moved on average since half of the clip: where none is seen at two times one after
     another, as fast as before and after."""
-    lapses = np.diff(times)
-    speeds = np.full((len(lapses), 3), np.nan)
-    for t, both in enumerate(seen[1:] & seen[:-1]):
-        if both.any():
-            speeds[t] = (paths[t + 1, both] - paths[t, both]).mean(axis=0) / lapses[t]
-    known = np.flatnonzero(np.isfinite(speeds[:, 0]))
+    lapses, steps, both = np.diff(times), np.diff(paths, axis=0), seen[1:] & seen[:-1]
+    known = np.flatnonzero(both.any(axis=1) & (lapses > 0))
     if not len(known):
         return np.zeros_like(paths[:, 0])
-    speeds = np.stack([np.interp(np.arange(len(speeds)), known, speeds[known, k]) for k in range(3)], axis=1)
-    way = np.concatenate([np.zeros((1, 3)), np.cumsum(speeds * lapses[:, None], axis=0)])
+    speeds = np.array([steps[t, both[t]].mean(axis=0) / lapses[t] for t in known], np.float64)
+    filled = np.stack([np.interp(np.arange(len(lapses)), known, axis) for axis in speeds.T], axis=1)
+    way = np.concatenate([np.zeros((1, 3)), np.cumsum(filled * lapses[:, None], axis=0)])
     return (way - way[len(way) // 2]).astype(np.float32)
 
 
 def _levels(residual: Residual) -> list[Floats]:
     """For each of BLURS (H, W, 12): colors and mask, and their slopes along x and along y."""
     planes = np.concatenate([residual.image, residual.mask[..., None]], axis=2).astype(np.float32)
-    levels = []
-    for blur in BLURS:
-        blurred = ndimage.gaussian_filter(planes, (blur, blur, 0))
-        along_y, along_x = np.gradient(blurred, axis=(0, 1))
-        levels.append(np.concatenate([blurred, along_x, along_y], axis=2))
-    return levels
+    blurred = (ndimage.gaussian_filter(planes, (blur, blur, 0)) for blur in BLURS)
+    return [np.concatenate([each, *np.gradient(each, axis=(1, 0))], axis=2) for each in blurred]
 
 
 def _followed(levels: Sequence[list[Floats]], masks: Mask, key: int, pixels: NDArray[np.int64]) -> _Cutout:
@@ -151,6 +140,7 @@ def _followed(levels: Sequence[list[Floats]], masks: Mask, key: int, pixels: NDA
     maps, seen = np.tile(np.eye(2, 3), (len(masks), 1, 1)), np.zeros(len(masks), bool)
     explained = np.zeros_like(masks)
     seen[key] = explained[key, pixels[:, 1], pixels[:, 0]] = True
+    near = ndimage.binary_dilation(explained[key]).astype(np.float32)
     for way in (-1, 1):
         before, step = np.eye(2, 3), np.zeros((2, 3))
         for at in range(key + way, len(masks) if way > 0 else -1, way):
@@ -162,20 +152,18 @@ def _followed(levels: Sequence[list[Floats]], masks: Mask, key: int, pixels: NDA
                 break
             maps[at], seen[at] = found, True
             step, before = found - before, found
-            explained[at] = _explained(levels[key], levels[at], masks[at], pixels, found)
+            explained[at] = _explained(levels[key], levels[at], masks[at], near, found)
     return _Cutout(key, pixels, maps, seen, explained)
 
 
-def _registered(source: list[Floats], target: list[Floats], pixels: NDArray[np.int64], start: Map) -> tuple[Map, float]:
-    """The map (2, 3) of a cut-out's pixels to another image, and the share of them that look alike there."""
+def _registered(source: list[Floats], target: list[Floats], pixels: NDArray[np.int64], M: Map) -> tuple[Map, float]:
+    """The map (2, 3) of a cut-out's pixels to another image, near M, and the share of them that look alike there."""
     chosen = pixels[evenly_indices(len(pixels), PIXELS)]
     x, y = chosen.T
     middle = chosen.mean(axis=0)
     scale = max(float(chosen.std()), 1.0)
-    u, v = ((chosen - middle) / scale).T
-    M = start.copy()
+    basis = np.column_stack([(chosen - middle) / scale, np.ones(len(chosen))])
     height, width = source[0].shape[:2]
-    basis = np.stack([u, v, np.ones_like(u)], axis=1)
     for there, here in zip(target, source, strict=True):
         wanted = here[y, x, :4]
         for _ in range(ITERATIONS):
@@ -210,14 +198,13 @@ def _sampled(planes: Floats, at: NDArray[np.float64]) -> Floats:
     return above * (1 - b) + below * b
 
 
-def _explained(source: list[Floats], target: list[Floats], mask: Mask, pixels: NDArray[np.int64], M: Map) -> Mask:
-    """(H, W) the moving pixels of another image that look like those of the cut-out that a map takes there."""
-    cut, result = np.zeros_like(mask), np.zeros_like(mask)
-    cut[pixels[:, 1], pixels[:, 0]] = True
+def _explained(source: list[Floats], target: list[Floats], mask: Mask, near: Floats, M: Map) -> Mask:
+    """(H, W) the moving pixels of another image that look like those of the cut-out that a map takes there. near:
+    (H, W) 1 in the cut-out and beside it, else 0."""
+    result = np.zeros_like(mask)
     rows, columns = np.nonzero(mask)
     back = np.linalg.inv(M[:, :2]) @ (np.stack([columns, rows]) - M[:, 2:])
-    near = ndimage.binary_dilation(cut)
-    inside = ndimage.map_coordinates(near.astype(np.float32), back[::-1], order=0) > 0
+    inside = ndimage.map_coordinates(near, back[::-1], order=0) > 0
     alike = np.abs(_sampled(source[1][..., :3], back) - target[1][rows, columns, :3]).max(axis=1) < ALIKE
     result[rows, columns] = inside & alike
     return result
@@ -234,13 +221,12 @@ def _depths(mask: Mask, depth: Floats) -> Floats:
         if len(rows) < LEAST * mask.size:
             continue
         lowest = np.full(mask.shape[1], -1)
-        np.maximum.at(lowest, columns, rows)
-        at = np.flatnonzero(lowest >= rows.max() - FOOT * (np.ptp(rows) + 1))
-        below = lowest[at] + FAR_BELOW
-        ground = free[below[below < mask.shape[0]], at[below < mask.shape[0]]]
-        if np.isfinite(ground).mean() < 0.3 if len(ground) else True:  # below the image
+        lowest[columns] = rows  # ascending
+        at = np.flatnonzero((lowest >= rows[-1] - FOOT * (np.ptp(rows) + 1)) & (lowest < len(mask) - FAR_BELOW))
+        ground = free[lowest[at] + FAR_BELOW, at]
+        if not len(ground) or np.isfinite(ground).mean() < 0.3:  # below the image
             ring = ndimage.binary_dilation(part, iterations=8)
-            ground = np.sort(free[ring][np.isfinite(free[ring])])[: max(1, int(0.3 * ring.sum()))]
+            ground = np.sort(free[ring])[: max(1, int(0.3 * ring.sum()))]
         behind = depth[part][np.isfinite(depth[part])]
         nearest = [np.nanmedian(ground)] if np.isfinite(ground).any() else []
         nearest += [np.quantile(behind, HIDDEN)] if len(behind) else []
@@ -255,23 +241,18 @@ def _placed(cutout: _Cutout, images: Sequence[Residual], depths: Sequence[Floats
     x, y = chosen.T
     at = np.einsum("tij,jn->tin", cutout.maps[:, :, :2], chosen.T) + cutout.maps[:, :, 2:]
     height, width = depths[0].shape
-    depth = np.full(len(images), np.nan)
-    for t in np.flatnonzero(cutout.seen).tolist():
+    seen = np.flatnonzero(cutout.seen).tolist()
+    inverse: dict[int, float] = {}
+    for t in seen:
         column, row = np.rint(at[t]).astype(np.int64).clip(0, [[width - 1], [height - 1]])
         near = depths[t][row, column]
         if np.isfinite(near).any():
-            depth[t] = np.nanmedian(near)
-    depth = _smooth(depth)
+            inverse[t] = np.float64(1.0) / np.nanmedian(near)
+    depth = np.ones(len(images))
+    if inverse:  # nearly a line over a few times
+        filled = np.interp(np.arange(len(images)), list(inverse), list(inverse.values()))
+        depth = 1 / ndimage.gaussian_filter1d(ndimage.median_filter(filled, 9, mode="nearest"), 3.0, mode="nearest")
     paths = np.zeros((len(images), len(chosen), 3), np.float32)
-    for t in np.flatnonzero(cutout.seen).tolist():
+    for t in seen:
         paths[t] = points_at(images[t].camera, at[t].T + 0.5, depth[t : t + 1])
     return paths, images[cutout.key].image[y, x].astype(np.float32)
-
-
-def _smooth(depth: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(T,) depths whose inverses are nearly a line over a few times."""
-    known = np.isfinite(depth)
-    if not known.any():
-        return np.ones_like(depth)
-    filled = np.interp(np.arange(len(depth)), np.flatnonzero(known), 1 / depth[known])
-    return 1 / ndimage.gaussian_filter1d(ndimage.median_filter(filled, 9, mode="nearest"), 3.0, mode="nearest")

@@ -93,52 +93,40 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
     are any, and a field that moves the latter. It moves from the first step on. The rates rise first: Adam's first
     steps, all of the size of the rate, would shake off what the field knows.
 
-    Args:
-        config: resolved for the dataset.
-        dataset: the capture.
-        device: that trains.
-        own_field: of Scene4D.
-
-    Returns:
-        The start of the training. The same configuration and capture give the same one.
-
-    Raises:
-        InputError: the images show nothing at all.
+    config: resolved for the dataset. own_field: of Scene4D. The same configuration and capture give the same start.
+    Raises InputError where the images show nothing at all.
     """
     started = time.perf_counter()
     generator = torch.Generator().manual_seed(config.seed)
     found = _in_hull(config, dataset, device) if dataset.is_surrounded else None
     found = found or _in_residuals(config, dataset, device, generator)
-    static, tracks, sheets, light = found.static, found.tracks, found.sheets, found.light
-    scene = scene_with(static, tracks, config, generator, own_field, sheets=sheets)
-    summary = f"{found.share:.1%} of what it lacks can be followed: nothing is added"
+    tracks, share, light, sheets = found.tracks, found.share, found.light, found.sheets
+    scene = _scene_with(found, config, generator, own_field)
+    field_fitted, summary = 0.0, f"{share:.1%} of what it lacks can be followed: nothing is added"
     if tracks is not None:
-        steps = config.discovery.field_steps
+        steps, parts = config.discovery.field_steps, len(np.unique(tracks.part))
         meter = Progress(steps, "steps of motion discovery, part 2 of 2: what moves")
         error = fit_field(scene, tracks, found.times, steps, generator, meter.at, fades=sheets, light=light)
         meter.clear()
         if error is None:
             summary = "the field cannot move what it lacks: nothing is added"
-            tracks, scene = None, scene_with(static, None, config, generator, own_field, sheets=False)
+            scene = _scene_with(found._replace(tracks=None), config, generator, own_field)
         else:
-            rigid = f", {len(light)} of them as rigid bodies" if light else ""
             summary = (
-                f"{len(np.unique(tracks.part))} moving parts with {len(tracks.part)} Gaussians, {found.share:.0%} of "
-                f"what it lacks, followed within {error:.3f} world units{rigid}"
+                f"{parts} moving parts with {len(tracks.part)} Gaussians, {share:.0%} of what it lacks, followed "
+                f"within {error:.3f} world units" + (f", {len(light)} of them as rigid bodies" if light else "")
             )
+            if share >= NEARLY_ALL:
+                field_fitted = ALL_TURN if len(light) == parts else SHEETS if sheets else 1.0
     order = morton_order(scene.parameters["means"].detach())
     for name, values in scene.parameters.items():
         scene.parameters[name] = torch.nn.Parameter(values.detach()[order])
-    field_fitted = 0.0
-    if tracks is not None and found.share >= NEARLY_ALL:
-        all_turn = len(light) == len(np.unique(tracks.part))
-        field_fitted = ALL_TURN if all_turn else SHEETS if sheets else 1.0
     return Start(
         scene,
         ramp_steps=config.schedule.warm_up or RAMP_STEPS,
         field_fitted=field_fitted,
         corrections=found.corrections,
-        summary=f"{found.origin} of {len(static)} Gaussians; {summary}",
+        summary=f"{found.origin} of {len(found.static)} Gaussians; {summary}",
         seconds=time.perf_counter() - started,
     )
 
@@ -198,7 +186,7 @@ def _in_residuals(config: Config, dataset: Dataset, device: Device, generator: t
         share = explained_share(clouds, tracks)
     if share < config.discovery.least:
         tracks = None
-    if tracks is not None and depths is None:
+    elif tracks is not None and depths is None:
         stands, turns = find_turns(tracks, times, images)
         if turns:
             tracks, light = rigid_tracks(tracks, stands, turns, times, images, device, generator)
@@ -206,22 +194,15 @@ def _in_residuals(config: Config, dataset: Dataset, device: Device, generator: t
     return _Found(static, tracks, times, share, "a static fit", light, depths is not None, corrections)
 
 
-def scene_with(
-    static: Scene4D,
-    tracks: Tracks | None,
-    config: Config,
-    generator: torch.Generator,
-    own_field: nn.Module | None,
-    *,
-    sheets: bool,
-) -> Scene4D:
+def _scene_with(found: _Found, config: Config, generator: torch.Generator, own_field: nn.Module | None) -> Scene4D:
     """The Gaussians of what stands still, then one for each track; the field does not move them yet."""
+    static, tracks, size = found.static, found.tracks, config.field.dynamics_size
     rows: dict[str, Tensor] = dict(static.parameters)
-    dynamics = torch.zeros(len(static), config.field.dynamics_size)
+    dynamics = torch.zeros(len(static), size)
     if tracks is not None:
-        rows = rows_with(static, tracks, sheets=sheets)
-        of_part = DYNAMICS * torch.randn(tracks.parts, config.field.dynamics_size, generator=generator)
-        if sheets and config.field.dynamics_size > 1:  # shown one after another, which the field can tell by these
+        rows = rows_with(static, tracks, sheets=found.sheets)
+        of_part = DYNAMICS * torch.randn(tracks.parts, size, generator=generator)
+        if found.sheets and size > 1:  # shown one after another, which the field can tell by these
             when = [tracks.supported[:, tracks.part == k].mean(axis=1) for k in range(len(of_part))]
             middle = np.array([np.average(np.linspace(-1, 1, len(each)), weights=each) for each in when])
             of_part[:, :2] = torch.from_numpy(np.stack([np.ones_like(middle), middle], axis=1)) * SHEET_DYNAMICS

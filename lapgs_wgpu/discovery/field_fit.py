@@ -56,14 +56,12 @@ def fit_field(
     if not groups:
         return None
     if (fades or light) and (head := getattr(field, "appearance", None)) is not None:  # outputs in that unit
-        own = {id(parameter) for parameter in head.parameters()}
-        groups = [(rate, [each for each in parameters if id(each) not in own]) for rate, parameters in groups]
+        own = set(head.parameters())
+        groups = [(rate, [one for one in each if one not in own]) for rate, each in groups]
         groups.append((MLP_RATE / APPEARANCE_SCALE, list(head.parameters())))
     if fades and isinstance(field, GridField) and field.config.dynamics_size > 1 and field.config.temporal_hash:
         _tell_times(field, generator)
-    optimizer = torch.optim.Adam(
-        [{"params": parameters, "lr": rate} for rate, parameters in groups], eps=ADAM_EPS, fused=True
-    )
+    optimizer = torch.optim.Adam([{"params": each, "lr": rate} for rate, each in groups], eps=ADAM_EPS, fused=True)
     paths, supported = torch.from_numpy(tracks.paths), torch.from_numpy(tracks.supported)
     beside = torch.from_numpy(ndimage.maximum_filter1d(tracks.supported, 3, axis=0)).float()
     canonical, codes = scene.parameters["means"].detach(), scene.parameters.get("dynamics")
@@ -79,10 +77,9 @@ def fit_field(
     errors: list[float] = []
     at_once, most = (AT_ONCE, MOVING // FEWER) if fades else (1, MOVING)
     for step in range(steps):
-        now: list[int] = []
-        for _ in range(at_once):
-            order = order or torch.randperm(len(times), generator=generator).tolist()
-            now.append(order.pop())
+        while len(order) < at_once:
+            order = torch.randperm(len(times), generator=generator).tolist() + order
+        now = [order.pop() for _ in range(at_once)]
         staying = torch.randint(max(still, 1), (min(still, STILL),), generator=generator)
         if len(tracks.part) > most:
             asked = torch.randint(len(tracks.part), (most,), generator=generator)
@@ -91,17 +88,15 @@ def fit_field(
             along, way = torch.rand(2, len(asked), 1, generator=generator)
             other = first[asked] + (along[:, 0] * count[asked]).long()
             way = way * (WITHIN + BEYOND) - BEYOND
-        rows = torch.cat([still + asked, staying])
         means = torch.cat([canonical[still + asked].lerp(canonical[still + other], way), canonical[staying]])
-        dynamics = None if codes is None else codes.detach()[rows]
+        dynamics = None if codes is None else codes.detach()[torch.cat([still + asked, staying])]
         sizes = [len(asked), len(staying)]
         loss, distance = torch.zeros(()), 0.0
         first_time, *others = (float(times[at]) for at in now)
         samples = TimeSamples(torch.arange(len(means)), tuple(others)) if others else None
         for at, move in zip(now, field.at_times(means, first_time, dynamics, None, samples), strict=True):
             seen, targets = supported[at, asked], paths[at, asked].lerp(paths[at, other], way)
-            moved = move.apply_to_means(means)
-            squared = (moved - torch.cat([targets, means[len(asked) :]])).square().sum(dim=1)
+            squared = (move.apply_to_means(means) - torch.cat([targets, means[len(asked) :]])).square().sum(dim=1)
             far = (squared + SOFTENING**2).sqrt()
             if fades:  # few are seen at a time; between two times, those of both
                 weights = HIDDEN + (1 - HIDDEN) * beside[at, asked]
@@ -137,7 +132,7 @@ def fit_field(
 
 
 def _tell_times(field: GridField, generator: torch.Generator) -> None:
-    """Have the decoder's units begin as hinges in time and in the time of a sheet's code (`discover.scene_with`): what
+    """Have the decoder's units begin as hinges in time and in the time of a sheet's code (`discover`): what
     moves and fades one after another is made of these. Without a code, as what stands still is, all are zero."""
     with torch.no_grad():
         for grid in field.grids[1:]:

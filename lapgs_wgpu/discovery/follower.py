@@ -54,10 +54,9 @@ class Follower:
         part = clouds.parts(template)
         kept = np.bincount(part)[part] >= LEAST_PART
         self.positions, self.colors = template.positions[kept], template.colors[kept]
-        self.part = np.unique(part[kept], return_inverse=True)[1].ravel()
-        sizes = np.bincount(self.part) if len(self.part) else np.zeros(0, np.int64)
+        self.part = np.unique(part[kept], return_inverse=True)[1]
         # Large parts choose first: what they explain is less attractive to the small ones.
-        members = [np.flatnonzero(self.part == k) for k in np.argsort(-sizes, kind="stable")]
+        members = [np.flatnonzero(self.part == k) for k in np.argsort(-np.bincount(self.part), kind="stable")]
         self._parts = [_Part(each, self._expected(each, trajectories)) for each in members]
         same = self.part[:, None] == self.part[None]
         sq_distances = ((self.positions[:, None] - self.positions[None]) ** 2).sum(axis=2)
@@ -85,13 +84,10 @@ class Follower:
         key, times = self._key, self._clouds.times
         paths = np.zeros((len(times), *self.positions.shape), np.float32)
         paths[key] = self.positions
-        past: dict[int, list[int]] = {1: [key], -1: [key]}  # times in the order in which a side was followed
-        for i in sorted(range(len(times)), key=lambda i: (abs(i - key), i))[1:]:
-            side = 1 if i > key else -1
-            known = past[side] if len(past[side]) >= MEMORY else past[-side][1:MEMORY][::-1] + past[side]
-            start = self._predict(times[known[-MEMORY:]], paths[known[-MEMORY:]], times[i])
-            paths[i] = self._register(start, i, first=len(past[side]) == 1)
-            past[side].append(i)
+        order = sorted(range(len(times)), key=lambda i: (abs(i - key), i))
+        for n, i in enumerate(order[1:], start=1):
+            known = sorted(order[:n], key=lambda j: -abs(j - i))[-MEMORY:]  # all lie on one side of it
+            paths[i] = self._register(self._predict(times[known], paths[known], times[i]), i)
         return paths
 
     def _predict(self, times: NDArray[np.float64], paths: Floats, t: float) -> Floats:
@@ -113,16 +109,15 @@ class Follower:
             positions[part.members] += step * min(1.0, longest / max(float(np.linalg.norm(step)), 1e-9))
         return positions
 
-    def _register(self, start: Floats, i: int, *, first: bool) -> Floats:
-        """Positions (n, 3) of the tracks' points among the points of time i, from a prediction and from where the
-        parts' centers are expected."""
+    def _register(self, positions: Floats, i: int) -> Floats:
+        """Positions (n, 3) of the tracks' points among the points of time i, from a prediction, which is changed, and
+        from where the parts' centers are expected."""
         points = self._clouds.clouds[i].thinned(DATA)
-        positions = start.copy()
         if len(points.scores) == 0:
             return positions
         free = np.ones(len(points.scores), np.float32)
         for part in self._parts:
-            free *= 1.0 - 0.9 * self._search(part, positions, points, free, i, first=first)
+            free *= 1.0 - 0.9 * self._search(part, positions, points, free, i)
         data, weights = points.positions, points.scores[:, None]
         alike = 0.2 + 0.8 * np.exp(-_sq_distances(points.colors, self.colors) / (2 * COLOR_SPREAD**2))
         for step in range(ROUNDS):
@@ -135,20 +130,19 @@ class Follower:
             positions = positions + (kernel @ (belongs.T @ data - mass * positions)) / (kernel @ mass + 1e-2)
         return positions
 
-    def _search(self, part: _Part, positions: Floats, points: Points, free: Floats, i: int, *, first: bool) -> Floats:
+    def _search(self, part: _Part, positions: Floats, points: Points, free: Floats, i: int) -> Floats:
         """Shift a part in `positions` to where it explains most of the points of time i, around where it is and around
         where its center is expected; (m,) how well it explains each point there."""
         widening = min(max(1.0, FAST * part.speed / (SEARCH * self._unit)), 2.0)
-        reach = 1.5 if first else widening + 0.25 * min(part.lost, 4)
+        reach = 1.5 if abs(i - self._key) == 1 else widening + 0.25 * min(part.lost, 4)
         starts = [np.zeros(3, np.float32)]
         if part.expected is not None:
             starts.append(part.expected[i] - positions[part.members].mean(axis=0))
         reaches, spreads = np.array([reach, 1.0], np.float32), np.array([widening, 1.0]) * PRIOR * self._unit
 
         def prior(shifts: Floats) -> NDArray[np.float64]:
-            sq_distances = [((shifts - start) ** 2).sum(axis=1) for start in starts]
-            likely = [np.exp(-sq / (2 * spread**2)) for sq, spread in zip(sq_distances, spreads, strict=False)]
-            return np.max(likely, axis=0)
+            pairs = zip(starts, spreads, strict=False)
+            return np.max([np.exp(-((shifts - at) ** 2).sum(axis=1) / (2 * spread**2)) for at, spread in pairs], axis=0)
 
         shifts = np.concatenate([start + scale * self._rough for start, scale in zip(starts, reaches, strict=False)])
         rough, _ = self._explained(part, positions, points, free, shifts, SEARCH_SPREADS[0])

@@ -25,23 +25,19 @@ def cubic_grid(axis: NDArray[Any]) -> NDArray[Any]:
 
 
 class Residual:
-    """A training image and its moving pixels.
+    """A training image at a time in [0, 1], and its moving pixels, the attribute mask (H, W).
 
-    Args:
-        camera: of the image.
-        time: in [0, 1].
-        image: (H, W, 3) in [0, 1].
-        still: (H, W, 3), the static fit's image of the same camera.
-        moving: (H, W), the moving pixels as masks tell them, which are completed; None to find them.
-
-    Attributes:
-        mask: (H, W), the moving pixels.
+    image: (H, W, 3) in [0, 1]. still: the same by the static fit. moving: (H, W), the moving pixels as masks tell them,
+    which are completed; None to find them.
     """
 
     def __init__(self, camera: Camera, time: float, image: Floats, still: Floats, moving: Mask | None = None) -> None:
         self.camera, self.time, self.image, self.still = camera, time, image, still
-        differs = differing_pixels(image, still)
-        self.mask = differs if moving is None else _completed(moving, differs)
+        self.mask = differing_pixels(image, still)
+        if moving is not None:  # masks from flow lack legs that are too fast for it
+            labels, count = ndimage.label(ndimage.binary_fill_holes(self.mask))
+            told = ndimage.mean(moving, labels, np.arange(count) + 1)
+            self.mask = moving | np.isin(labels, 1 + np.flatnonzero(told > PARTLY))
 
     @cached_property
     def _soft(self) -> Floats:
@@ -79,17 +75,9 @@ class Residual:
     def rays(self, most: int) -> tuple[Floats, Floats, Floats]:
         """Of at most `most` moving pixels, evenly chosen, the directions (n, 3) of depth 1, the blurred colors (n, 3),
         and their own (n, 3)."""
-        rows, columns = np.nonzero(self.mask)
-        chosen = evenly_indices(len(rows), most)
-        rows, columns = rows[chosen], columns[chosen]
+        places = np.argwhere(self.mask)
+        rows, columns = places[evenly_indices(len(places), most)].T
         K = self.camera.K
         u, v = (columns + 0.5 - K[0, 2]) / K[0, 0], (rows + 0.5 - K[1, 2]) / K[1, 1]
         directions = np.stack([u, v, np.ones(len(rows))], axis=1) @ self.camera.T_cam_world[:3, :3]
         return directions.astype(np.float32), self._blurred[rows, columns], self.image[rows, columns]
-
-
-def _completed(moving: Mask, differs: Mask) -> Mask:
-    """The moving pixels, and the rest of what differs where they tell a part: legs too fast for masks from flow."""
-    labels, count = ndimage.label(ndimage.binary_fill_holes(differs))
-    told = ndimage.mean(moving, labels, np.arange(count) + 1)
-    return moving | np.isin(labels, 1 + np.flatnonzero(told > PARTLY))

@@ -50,15 +50,11 @@ def rigid_tracks(
     centers = torch.from_numpy(np.stack([tracks.center(k) for k in parts], axis=1))
     soft_paths, soft_colors = torch.from_numpy(tracks.paths[:, others]), torch.from_numpy(tracks.colors[others])
     count = len(parts) * POINTS
-    points = torch.from_numpy(directions(POINTS)).float() * radii[:, None, None]
-    size = torch.log(SPACING * (4 * np.pi / POINTS) ** 0.5 * radii)[:, None].repeat(1, POINTS).ravel()
-    soft_size = torch.full((int(others.sum()),), float(size.mean()))
-    around = {
-        name: torch.from_numpy(parabolas(times, np.ones(len(times)), spread)).float()
-        for name, spread in SPREADS.items()
-    }
+    size = torch.log(SPACING * (4 * np.pi / POINTS) ** 0.5 * radii).repeat_interleave(POINTS)
+    soft_size = torch.full((len(soft_colors),), float(size.mean()))
+    around = {name: torch.from_numpy(parabolas(times, 1.0, spread)).float() for name, spread in SPREADS.items()}
     values = {
-        "points": points,
+        "points": torch.from_numpy(directions(POINTS)).float() * radii[:, None, None],
         "colors": torch.cat([torch.full((count, 3), 0.4), soft_colors]),
         "sizes": torch.cat([size, soft_size]),
         "opacities": torch.full((count + len(soft_size),), OPACITY),
@@ -122,18 +118,11 @@ def rigid_tracks(
         mean = light.mean(dim=0)
         colors = (values["colors"][:count].reshape(len(parts), POINTS, 3) * mean[..., None]).clamp(0, 1).numpy()
         lights = (light / mean).numpy()
-    bodies = {k: (paths[:, n].numpy(), colors[n]) for n, k in enumerate(parts) if rigid[n]}
-    return _with_bodies(tracks, stands, bodies), {k: lights[:, n] for n, k in enumerate(parts) if rigid[n]}
-
-
-def _with_bodies(tracks: Tracks, stands: NDArray[np.int64], bodies: Mapping[int, tuple[Floats, Floats]]) -> Tracks:
-    """The tracks, with bodies in place of parts, by these their paths (T, POINTS, 3) and colors (POINTS, 3); their
-    positions are those at the times where the parts were found."""
-    others = ~np.isin(stands[tracks.part], list(bodies))
-    parts = [tracks.rows(others)]
-    for k, (paths, colors) in bodies.items():
-        part = tracks.rows(tracks.part == k)
-        away = np.linalg.norm(tracks.center(k) - part.positions.mean(axis=0), axis=1)
+    bodies = {k: n for n, k in enumerate(parts) if rigid[n]}
+    found = [tracks.rows(~np.isin(stands[tracks.part], list(bodies)))]
+    for k, n in bodies.items():
+        part, own = tracks.rows(tracks.part == k), paths[:, n].numpy()
+        key = np.linalg.norm(tracks.center(k) - part.positions.mean(axis=0), axis=1).argmin()  # where it was found
         seen = np.repeat(part.supported[:, :1], POINTS, axis=1)
-        parts.append(Tracks(paths[int(away.argmin())], colors, np.full(POINTS, k), paths, seen))
-    return all_of(parts)
+        found.append(Tracks(own[key], colors[n], np.full(POINTS, k), own, seen))
+    return all_of(found), {k: lights[:, n] for k, n in bodies.items()}

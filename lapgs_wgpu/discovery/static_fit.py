@@ -88,8 +88,7 @@ def static_fit(config: Config, dataset: Dataset, device: Device, progress: Calla
     for view in small:
         image = (composite(view.load(), background.numpy()) / 255).astype(np.float32)
         camera = view.camera if refinement is None else refinement.refined(view.camera)
-        rendering = training.scene.render(camera, view.time, background, depth=False)
-        still = rendering.image.numpy(force=True)
+        still = training.scene.render(camera, view.time, background, depth=False).image.numpy(force=True)
         if (correction := training.exposure_of(view)) is not None:
             image = without_exposure(image, correction.numpy(force=True))
         if (ignored := view.load_ignored()) is not None:
@@ -100,8 +99,8 @@ def static_fit(config: Config, dataset: Dataset, device: Device, progress: Calla
             depths.append(depth_of(training.scene, camera))
     corrections = None
     if refinement is not None:
-        cameras = {before.camera: after.camera for before, after in zip(picked, small, strict=True)}
-        corrections = {camera: refinement.correction(fitted) for camera, fitted in cameras.items()}
+        pairs = zip(picked, small, strict=True)
+        corrections = {before.camera: refinement.correction(after.camera) for before, after in pairs}
     return StaticFit(training.scene, images, depths or None, corrections)
 
 

@@ -22,7 +22,6 @@ from lapgs_wgpu.discovery.residual import Floats, Residual, cubic_grid
 RAYS = 300  # of an image, at most
 DEPTHS = 64  # that are tried along a ray
 NEIGHBORS = 6  # images that vote on a depth, those nearest in time
-SPAN = 1.0  # time steps, at which a vote counts half
 COLOR_SPREAD = 0.25  # standard deviation of the colors of one surface in several images
 COLOR_SHARE = 0.7  # of a vote that depends on the color
 GRID = 48  # cells along an axis of the grid of what is residual at all times
@@ -78,9 +77,7 @@ class PointClouds(NamedTuple):
         """(n,) number of the connected part of each of some points, where points closer than LINK are connected."""
         positions = np.hstack([points.positions, self.tint * points.colors]) if self.tint else points.positions
         pairs = cKDTree(positions).query_pairs(LINK * self.half_side, output_type="ndarray")
-        graph = coo_array(
-            (np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(positions), len(positions))
-        )
+        graph = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(positions), len(positions)))
         return connected_components(graph, directed=False)[1].astype(np.int64)
 
     def nearest(self, paths: Floats) -> list[tuple[NDArray[np.float64], NDArray[np.int64]]]:
@@ -115,8 +112,9 @@ def _points(image: Residual, neighbors: list[tuple[Residual, float]], always: Fl
     length = np.linalg.norm(directions, axis=1, keepdims=True)
     spacing = float(np.median(length[:, 0] * (depths[:, 1] - depths[:, 0])))
     votes, tolerant, weights = np.zeros((3, *depths.shape))
-    of_neighbors = [1.0 / (1.0 + (lapse / SPAN) ** 2) for _, lapse in neighbors]
-    for (neighbor, lapse), weight in zip(neighbors, of_neighbors, strict=True):
+    most = 0.0
+    for neighbor, lapse in neighbors:
+        weight = 1.0 / (1.0 + lapse**2)  # a half at one time step
         mask, shown, inside = neighbor.sample(places)
         sq_distances = ((shown - blurred[:, None]) ** 2).sum(axis=2)
         agreement = 1.0 - COLOR_SHARE + COLOR_SHARE * np.exp(-sq_distances / (2 * COLOR_SPREAD**2))
@@ -124,12 +122,17 @@ def _points(image: Residual, neighbors: list[tuple[Residual, float]], always: Fl
         votes += vote
         # Standard deviation of the depths at which things seem to be that move while the camera goes to the neighbor.
         parallax = float(np.linalg.norm(neighbor.camera.position - eye)) / max(float(np.linalg.norm(eye)), 1e-6)
-        tolerant += _blur_along_rays(vote, MOTION * half_side * lapse / max(parallax, 1e-6) / spacing)
+        spread = MOTION * half_side * lapse / max(parallax, 1e-6) / spacing
+        if spread > DEPTHS:
+            tolerant += vote.mean(axis=1, keepdims=True)
+        else:
+            tolerant += ndimage.gaussian_filter1d(vote, max(spread, 0.1), axis=1, mode="nearest", truncate=3.0)
         weights += weight * inside
+        most += weight
     at = np.moveaxis((places / half_side + 1) * 0.5 * GRID - 0.5, -1, 0)
     share = ndimage.map_coordinates(always, at, order=1, mode="nearest")
     known = np.clip((ALWAYS - share) / ALWAYS_WIDTH, 0.0, 1.0) / np.maximum(weights, 1e-6)
-    known[weights < 0.5 * sum(of_neighbors)] = 0.0  # hardly seen by others
+    known[weights < 0.5 * most] = 0.0  # hardly seen by others
     scores = votes * known
     past_middle = (places * directions[:, None]).sum(axis=2) / length
     middle = _middle_of_best(tolerant * known * np.exp(-0.5 * (past_middle / (MIDDLE * half_side)) ** 2))
@@ -138,13 +141,6 @@ def _points(image: Residual, neighbors: list[tuple[Residual, float]], always: Fl
     positions = eye + depth[:, None] * directions
     best = scores.max(axis=1)
     return Points(positions.astype(np.float32), colors, best.astype(np.float32)).chosen(best > LEAST_SCORE)
-
-
-def _blur_along_rays(votes: NDArray[np.floating], spread: float) -> NDArray[np.floating]:
-    """Votes (n, DEPTHS) along each ray, blurred by a Gaussian of this standard deviation, in depths."""
-    if spread > DEPTHS:
-        return np.broadcast_to(votes.mean(axis=1, keepdims=True), votes.shape)
-    return ndimage.gaussian_filter1d(votes, max(spread, 0.1), axis=1, mode="nearest", truncate=3.0)
 
 
 def _depths(eye: Floats, directions: Floats, half_side: float) -> Floats:
@@ -168,8 +164,6 @@ def _middle_of_best(scores: NDArray[np.floating]) -> NDArray[np.float64]:
 
 def _dense(points: Points, half_side: float) -> Points:
     """The points without isolated ones."""
-    if len(points.scores) < 5:
-        return points.thinned(0)
     distances, _ = cKDTree(points.positions).query(points.positions, k=5)
     return points.chosen(distances[:, 4] < LONELY * half_side)
 

@@ -68,8 +68,7 @@ class Tracks(NamedTuple):
         chosen = kept[self.part]
         if not chosen.any():
             return None
-        part = np.unique(self.part[chosen], return_inverse=True)[1].ravel()
-        return self.rows(chosen)._replace(part=part)
+        return self.rows(chosen)._replace(part=np.unique(self.part[chosen], return_inverse=True)[1])
 
     def rows(self, chosen: NDArray[np.bool_]) -> "Tracks":
         """The tracks (n,) that are set, with the numbers of their parts."""
@@ -79,9 +78,8 @@ class Tracks(NamedTuple):
 
 def all_of(tracks: Sequence[Tracks]) -> Tracks:
     """The tracks of several sets, at least one, in their order."""
-    positions, colors, part, paths, supported = zip(*tracks, strict=True)
-    of_time = np.concatenate(paths, axis=1), np.concatenate(supported, axis=1)
-    return Tracks(np.concatenate(positions), np.concatenate(colors), np.concatenate(part), *of_time)
+    columns = list(zip(*tracks, strict=True))
+    return Tracks(*map(np.concatenate, columns[:3]), *(np.concatenate(each, axis=1) for each in columns[3:]))
 
 
 def find_tracks(clouds: PointClouds) -> Tracks | None:
@@ -124,20 +122,16 @@ def _tracks_by(many: float, clouds: PointClouds, trajectories: list[Trajectory])
         reached = [(distances < REACH * clouds.half_side, of) for distances, of in clouds.nearest(paths)]
         explained = np.stack([np.bincount(tracks.part[of[near]], minlength=tracks.parts) for near, of in reached])
         if (steady := tracks.of_parts(_steady(tracks, paths, explained, clouds.half_side))) is not None:
-            found.append(steady)
+            found.append(steady._replace(part=steady.part + (found[-1].parts if found else 0)))
         for mask, (near, _) in zip(free, reached, strict=True):
             mask &= ~near
-    if not found:
-        return None
-    offsets = np.cumsum([0, *(tracks.parts for tracks in found[:-1])])
-    return all_of([each._replace(part=each.part + offset) for each, offset in zip(found, offsets, strict=True)])
+    return all_of(found) if found else None
 
 
 def _key_time(rest: list[Points], many: float, clouds: PointClouds) -> int | None:
     """The time of most of the points that are left among those at which many parts are apart."""
     some = [points.thinned(PROBES) for points in rest]
-    sizes = [np.bincount(clouds.parts(_around(some, i)), minlength=1) for i in range(len(some))]
-    parts = np.array([(each >= LEAST_PART).sum() for each in sizes])
+    parts = np.array([(np.bincount(clouds.parts(_around(some, i))) >= LEAST_PART).sum() for i in range(len(some))])
     if not parts.any():
         return None
     usual = int(np.quantile(parts[parts > 0], many))
@@ -153,18 +147,14 @@ def _around(clouds: list[Points], i: int) -> Points:
 
 def _voxels(points: Points, size: float, least: int) -> Points:
     """One point for each cell with at least `least` points: their mean by score."""
-    cells, of, counts = np.unique(
+    _, of, counts = np.unique(
         np.floor(points.positions / size).astype(np.int64), axis=0, return_inverse=True, return_counts=True
     )
-    of = of.ravel()
-    weights = np.bincount(of, points.scores, minlength=len(cells))
-
-    def mean(values: Floats) -> Floats:
-        sums = [np.bincount(of, points.scores * values[:, k], minlength=len(cells)) for k in range(3)]
-        return (np.stack(sums, axis=1) / weights[:, None]).astype(np.float32)
-
-    kept = counts >= least
-    return Points(mean(points.positions)[kept], mean(points.colors)[kept], (weights / counts)[kept].astype(np.float32))
+    factors = (1.0, *points.positions.T, *points.colors.T)
+    weights, *sums = (np.bincount(of.ravel(), points.scores * factor) for factor in factors)
+    means = np.stack([*(each / weights for each in sums), weights / counts], axis=1)
+    kept = means[counts >= least].astype(np.float32)
+    return Points(kept[:, :3], kept[:, 3:6], kept[:, 6])
 
 
 def _tracks_from(
@@ -179,17 +169,20 @@ def _tracks_from(
         if found is not None:
             start = _at_key_time(key, found[0].paths, clouds)
         follower = Follower(_voxels(start, VOXEL * clouds.half_side, least).thinned(most), key, clouds, trajectories)
-        part = follower.part
-        if len(part) == 0:
+        if len(follower.part) == 0:
             break
         paths = follower.follow()
-        supported = np.zeros(paths.shape[:2], bool)
-        for i, points in enumerate(clouds.clouds):
-            if len(points.scores):
-                near = cKDTree(points.positions).query(paths[i])[0] < REACH * clouds.half_side
-                supported[i] = (np.bincount(part, near) / np.bincount(part))[part] > SUPPORTED
-        smooth = _smoothed(clouds.times, paths, supported, part)
-        found = Tracks(follower.positions, follower.colors, part, smooth, supported), paths
+        distances = [cKDTree(cloud.positions).query(at)[0] for cloud, at in zip(clouds.clouds, paths, strict=True)]
+        near = np.array(distances) < REACH * clouds.half_side
+        supported, smooth = np.empty_like(near), np.empty_like(paths)
+        for k in range(follower.part.max() + 1):
+            members = follower.part == k
+            seen = near[:, members].mean(axis=1) > SUPPORTED
+            supported[:, members] = seen[:, None]
+            # The image of a time shows one side of a part, and pulls it towards that side.
+            fitted = parabolas(clouds.times, np.where(seen, 1.0, UNSUPPORTED), SMOOTHING)
+            smooth[:, members] = np.tensordot(fitted, paths[:, members], axes=1)
+        found = Tracks(follower.positions, follower.colors, follower.part, smooth, supported), paths
     return found
 
 
@@ -229,7 +222,7 @@ def _steady(tracks: Tracks, paths: Floats, explained: NDArray[np.int64], half_si
     return steady
 
 
-def parabolas(times: NDArray[np.float64], weights: NDArray[np.float64], spread: float) -> NDArray[np.floating]:
+def parabolas(times: NDArray[np.float64], weights: NDArray[np.float64] | float, spread: float) -> NDArray[np.floating]:
     """(T, T) what turns values at the times (T,) into those of the parabolas fitted around each, by weights (T,) of
     the values and by a Gaussian of this standard deviation, time steps."""
     clock = times / time_step(times)
@@ -237,16 +230,3 @@ def parabolas(times: NDArray[np.float64], weights: NDArray[np.float64], spread: 
     basis = np.stack([np.ones_like(lapses), lapses, lapses**2], axis=2)
     weighted = np.swapaxes(basis, 1, 2) * (np.exp(-0.5 * lapses**2) * weights)[:, None]
     return np.linalg.solve(weighted @ basis + np.diag([0.0, RIDGE, RIDGE]), weighted)[:, 0]
-
-
-def _smoothed(
-    times: NDArray[np.float64], paths: Floats, supported: NDArray[np.bool_], part: NDArray[np.int64]
-) -> Floats:
-    """Paths (T, n, 3), each a parabola fitted to the times around: the image of a time shows one side of a part, and
-    pulls it towards that side."""
-    smooth = np.empty_like(paths)
-    for k in range(int(part.max()) + 1):
-        members = part == k
-        weights = np.where(supported[:, members][:, 0], 1.0, UNSUPPORTED)
-        smooth[:, members] = np.tensordot(parabolas(times, weights, SMOOTHING), paths[:, members], axes=1)
-    return smooth

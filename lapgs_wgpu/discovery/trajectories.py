@@ -1,13 +1,11 @@
 """Trajectories: where groups of surface points go over the whole clip, as far as their centers tell.
 
-The points of a time form groups. Dynamic programming links the groups of all times to the path that explains most of
-them and bends least; the groups on it are then worth less, and the next path is looked for. A path may leap over times
-at which nothing is seen, and may turn sharply a few times. What follows parts step by step (`tracks`) takes the
-trajectories as a second opinion, since it goes astray where things are fast, hidden, or turn sharply.
+Dynamic programming links the groups of points of all times to the path that explains most of them and bends least;
+its groups are then worth less, and the next path is looked for. A path may leap over times at which nothing is seen,
+and may turn sharply a few times. `tracks` takes it as a second opinion where things are fast, hidden, or turn sharply.
 
-Paths that were found one after another share groups, and change over where things meet. So as many paths as there
-usually are groups are given the groups of each time at once, one to one, and paths that meet part in the way in which
-they bend least; so do all across a gap between the images, in which things may have gone anywhere.
+Such paths share groups, and change over where things meet. So as many paths as there usually are groups are given the
+groups of each time at once, one to one; those that meet, and all across a gap between the images, bend least.
 """
 
 from itertools import combinations
@@ -49,11 +47,8 @@ class Trajectory(NamedTuple):
 
 
 class _Groups(NamedTuple):
-    """The groups of all times.
-
-    clock: (T,) all times, in typical time steps. half_side: of the box. Of each group time: (n,) its index. centers,
-    colors: (n, 3). worth: (n,) in [0, 1].
-    """
+    """The groups of all times. clock: (T,) these, in typical time steps. half_side: of the box. time: (n,) the index of
+    each group's. centers, colors: (n, 3). worth: (n,) in [0, 1]."""
 
     clock: NDArray[np.float64]
     half_side: float
@@ -204,9 +199,8 @@ def _smooth(groups: _Groups, path: list[int], *, alone: bool = False, bent: bool
     weights = counted * np.exp(-0.5 * (lapses / (WINDOW + np.where(leapt, 0.5, 1.0) * nearest)) ** 2)
     result = np.zeros((len(lapses), 3), np.float32)
     for i, (weight, lapse) in enumerate(zip(weights, lapses, strict=True)):
-        basis = np.vander(lapse, 3 if leapt[i, 0] else 2, increasing=True)
+        ridge = [0.0, 1e-3, 1e-2] if leapt[i, 0] else [0.0, 1e-3 + nearest[i, 0]]  # its ends hardly go on
+        basis = np.vander(lapse, len(ridge), increasing=True)
         product = basis.T * weight
-        # Beyond its ends a path hardly goes on.
-        ridge = np.diag([0.0, 1e-3, 1e-2] if leapt[i, 0] else [0.0, 1e-3 + nearest[i, 0]])
-        result[i] = np.linalg.solve(product @ basis + ridge, product @ centers)[0]
+        result[i] = np.linalg.solve(product @ basis + np.diag(ridge), product @ centers)[0]
     return result

@@ -36,8 +36,8 @@ DARK = 0.2  # least light, of the mean brightness
 KEYS = 3  # times around which the turn is looked for
 WINDOW = 8.0  # time steps on either side
 FASTEST = 36.0  # degrees a time step
-# The searches, from rough to fine: degrees between turns, time steps on either side over which images are compared,
-# and how many turns the next one looks around.
+# The searches, from rough to fine: degrees between turns, half of those before; time steps on either side over which
+# images are compared; and how many turns the next one looks around.
 SEARCHES = (8.0, 3, 12), (4.0, 5, 4), (2.0, 8, 1)
 CELL, FINE = 0.18, 0.12  # radii; size of the places at which colors are compared, in the search and from there on
 SIDE = int(2 / FINE) + 3  # of these along an axis
@@ -82,15 +82,15 @@ def find_turns(
     middles, sizes = np.stack([centers[k] for k in things], axis=1), radii[things]
     for _ in range(OUTLINES):
         middles, sizes = _outlined(times, middles, sizes, images)
-    clock, near = times / time_step(times), parabolas(times, np.ones(len(times)), SPREAD)
+    clock, near = times / time_step(times), parabolas(times, 1.0, SPREAD)
     found = {}
     for n, k in enumerate(things.tolist()):
         looks = _looks(n, times, middles, sizes, images)
         if sum(len(look.places) > 0 for look in looks) < LEAST_TIMES:
             continue
         R = _smoothed(_turns(looks, clock), clock, near)
-        known = _known(looks, R)
-        again = [_turn_of(look, each, known - _known([look], each[None])) for look, each in zip(looks, R, strict=True)]
+        known = sum(map(_known, looks, R), np.zeros(()))
+        again = [_turn_of(look, each, known - _known(look, each)) for look, each in zip(looks, R, strict=True)]
         R = _smoothed(np.stack(again), clock, near)
         places, colors = (np.concatenate(each) for each in zip(*looks, strict=True))
         still = _explained(places, colors)
@@ -211,28 +211,25 @@ def _turn_at(looks: list[_Look], clock: Doubles, key: int) -> tuple[Doubles, flo
             values.append(_explained(np.einsum("ni,nij->nj", places, R[of]), colors, (blocks - blocks.min())[of]))
         return np.array(values)
 
-    widest, far = SEARCHES[0][0], FASTEST // SEARCHES[0][0]
-    turns = widest * cubic_grid(np.arange(-far, far + 1.0))
+    far = FASTEST // SEARCHES[0][0]
+    turns = SEARCHES[0][0] * cubic_grid(np.arange(-far, far + 1.0))
     turns = np.radians(turns[np.linalg.norm(turns, axis=1) <= FASTEST])
-    for step, reach, best in SEARCHES:
-        if step < widest:
-            around = np.radians(step) * cubic_grid(np.arange(-1.0, 2.0))
-            turns = np.unique((turns[:, None] + around).reshape(-1, 3).round(9), axis=0)
+    for step, reach, most in SEARCHES:
         values = explained(turns, reach)
-        turns = turns[np.argsort(-values, kind="stable")[:best]]
-    return turns[0], float(values.max() - explained(np.zeros((1, 3)), reach)[0])
+        best = turns[np.argsort(-values, kind="stable")[:most]]
+        around = np.radians(step / 2) * cubic_grid(np.arange(-1.0, 2.0))
+        turns = np.unique((best[:, None] + around).reshape(-1, 3).round(9), axis=0)
+    return best[0], float(values.max() - explained(np.zeros((1, 3)), reach)[0])
 
 
 def _turns(looks: list[_Look], clock: Doubles) -> Doubles:
     """(T, 3, 3) rotations of a part, from the key time at which a turn explains most. clock: (T,) time steps."""
     seen = np.flatnonzero([len(look.places) for look in looks])
-    keys = np.unique(seen[np.linspace(0, len(seen) - 1, KEYS + 2).round().astype(int)[1:-1]])
-    found = [_turn_at(looks, clock, int(key)) for key in keys]
-    best = int(np.argmax([gain for _, gain in found]))
-    key, turn = int(keys[best]), found[best][0]
+    keys = np.unique(seen[evenly_indices(len(seen), KEYS + 2)[1:-1]]).tolist()
+    turn, _, key = max(((*_turn_at(looks, clock, key), key) for key in keys), key=lambda found: found[1])
     lapses = clock - clock[key]
     R = Rotation.from_rotvec(lapses[:, None] * turn).as_matrix()
-    known = _known(looks[:0], R[:0])
+    known = np.zeros((4, SIDE, SIDE, SIDE))
     for i in sorted(range(len(looks)), key=lambda i: (abs(i - key), i)):
         last = i - np.sign(i - key) * np.arange(1, MEMORY + 2)
         if abs(lapses[i]) > KEPT and 0 <= last[-1] < len(looks):
@@ -240,19 +237,16 @@ def _turns(looks: list[_Look], clock: Doubles) -> Doubles:
             turn = (steps / (clock[last[:-1]] - clock[last[1:]])[:, None]).mean(axis=0)
             onward = Rotation.from_rotvec((clock[i] - clock[last[0]]) * turn).as_matrix()
             R[i] = _turn_of(looks[i], onward @ R[last[0]], known)
-        known += _known([looks[i]], R[i : i + 1])
+        known += _known(looks[i], R[i])
     return R
 
 
-def _known(looks: list[_Look], R: Doubles) -> Doubles:
-    """(4, SIDE, SIDE, SIDE) number of samples, and sums of their colors, that times of rotations R (T, 3, 3) show of a
+def _known(look: _Look, R: Doubles) -> Doubles:
+    """(4, SIDE, SIDE, SIDE) number of samples, and sums of their colors, that a time of rotation R (3, 3) shows of a
     ball's places of size FINE."""
-    sums = np.zeros((4, SIDE, SIDE, SIDE))
-    for look, turn in zip(looks, R, strict=True):
-        cells = _cells(look.places @ turn, FINE)
-        for each, values in zip(sums, [None, *look.colors.T], strict=True):
-            each += np.bincount(cells, values, each.size).reshape(each.shape)
-    return sums
+    cells = _cells(look.places @ R, FINE)
+    sums = [np.bincount(cells, values, SIDE**3) for values in (None, *look.colors.T)]
+    return np.array(sums, np.float64).reshape(4, SIDE, SIDE, SIDE)
 
 
 def _turn_of(look: _Look, expected: Doubles, sums: Doubles) -> Doubles:
