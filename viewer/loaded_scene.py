@@ -113,11 +113,9 @@ def load_scene(
         if antialiased is not None:
             file = dataclasses.replace(file, antialiased=antialiased)
         playback, frames = playback_of(file, device()), None
-    initial_view = InitialView.from_json(playback.metadata.get("view", ""))
-    if initial_view is None or up is not None:
-        frames = frames or (initial_view.frames if initial_view else None)
-        initial_view = guess_view(playback, up or playback.metadata.get("up"))
-    return LoadedScene(path, playback, initial_view._replace(frames=frames or initial_view.frames), file)
+    stored = InitialView.from_json(playback.metadata.get("view", ""))
+    view = stored if stored and up is None else guess_view(playback, up or playback.metadata.get("up"))
+    return LoadedScene(path, playback, view._replace(frames=frames or (stored or view).frames), file)
 
 
 def guess_view(playback: Playback, axis: str | None = None) -> InitialView:
