@@ -16,9 +16,6 @@ from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 Floats = NDArray[np.floating]
 Rows = NDArray[np.integer]
 
-_PICTURES = 4
-_VISIBLE = 40.0  # dB; below it a file has lost what is seen
-
 
 class Loss(NamedTuple):
     """psnr: of the worst image, dB, at most 100. reason: which Gaussians differ; empty where the loss is not seen."""
@@ -35,14 +32,14 @@ def measure(
     time: float | None = None,
     frames: int | None = None,
 ) -> Loss:
-    """Compare pictures of the captured images' size from around the focus.
+    """Compare four pictures of the captured images' size from around the focus; below 40 dB a loss is seen.
 
     written: the opened file. rows: which of the scene's Gaussians each of its is, where they are not the same.
     time: of all, in [0, 1]; by default from the clip's start to its end. frames: of a sequence, whose times the
     pictures have then.
     """
     rasterizer, pictures = Rasterizer(scene.playback.device), []
-    for camera, t in scene.around(_PICTURES, time):
+    for camera, t in scene.around(4, time):
         t = t if frames is None else round(t * (frames - 1)) / max(1, frames - 1)
         true, found = (
             rasterizer.draw_whole(playback.at(t), camera, scene.background).image.read()[:3].clip(0, 1)
@@ -51,7 +48,7 @@ def measure(
         error = float(np.mean((found.astype(np.float64) - true) ** 2))
         pictures.append((min(100.0, -10 * math.log10(max(error, 1e-20))), camera, t))
     psnr, camera, t = min(pictures, key=lambda picture: picture[0])
-    return Loss(psnr, "" if psnr >= _VISIBLE else _reason(scene, written, rows, camera, t))
+    return Loss(psnr, "" if psnr >= 40.0 else _reason(scene, written, rows, camera, t))
 
 
 def _reason(scene: LoadedScene, written: Playback, rows: Rows | None, camera: Camera, t: float) -> str:

@@ -13,8 +13,6 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.viewer.render_modes import MODES, Mode
 
-_TIMES = 9  # of the clip, at which the Gaussians' places are compared
-
 
 class FrameRequest(NamedTuple):
     """What to draw: equal requests give equal frames. antialiased: None for as the scene says."""
@@ -26,8 +24,7 @@ class FrameRequest(NamedTuple):
     antialiased: bool | None = None
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Frame:
+class Frame(NamedTuple):
     """A drawn frame.
 
     planes: as the rasterizer draws them, (4 or 5, height, width). low, high: the values at the ends of the scale, for
@@ -80,7 +77,8 @@ class FrameRenderer:
         return Frame(request, drawing.image, low, high, time.perf_counter() - start, splats)
 
     def _measure_motion(self) -> tuple[DeviceArray, float]:
-        places = np.stack([self.playback.at(t).means.read() for t in np.linspace(0, 1, _TIMES)])
+        """Compare the Gaussians' places at nine times of the clip."""
+        places = np.stack([self.playback.at(t).means.read() for t in np.linspace(0, 1, 9)])
         moved = np.linalg.norm(places - places.mean(axis=0), axis=2).max(axis=0).astype(np.float32)
         colors = self._pool.upload("motion", np.repeat(moved[:, None], 3, axis=1))
         return colors, max(float(np.percentile(moved, 98)) if len(moved) else 1.0, 1e-9)

@@ -34,8 +34,6 @@ MANIFEST = "sequence.json"
 SH_RANGE = 4.0  # of .4dgs: a coefficient is a byte from -this to +this (section 6.5 of the specification)
 USD_KIND = "ParticleField3DGaussianSplat"
 USD_DEGREE, USD_HARMONICS = "radiance:sphericalHarmonicsDegree", "radiance:sphericalHarmonicsCoefficients"
-_LAST = 1 - 1e-6  # time in the clip of a .4dgs at which its last pieces are still there
-_SPLATV = 0x674B  # the first word of a .splatv
 AXES = ("x", "y", "z", "-x", "-y", "-z")  # as .4dgs numbers them
 _POLYNOMIAL = [
     "x", "y", "z", *(f"motion_{i}" for i in range(9)), *(f"rot_{i}" for i in range(4)),
@@ -147,7 +145,7 @@ def read_splatv(path: Path) -> MovingFile:
     """The same in halves and bytes, 64 of them a Gaussian, behind a list of parts in JSON (antimatter15/splaTV)."""
     data = path.read_bytes()
     magic, length = struct.unpack("<II", data[:8].ljust(8, b"\0"))
-    if magic != _SPLATV or 8 + length > len(data):
+    if magic != 0x674B or 8 + length > len(data):
         raise InputError(f"{path}: begins with {data[:4]!r} and has {len(data)} bytes; it is no whole .splatv.")
     parts, begin = parse_json(data[8 : 8 + length].decode(errors="replace"), str(path)), 8 + length
     try:
@@ -215,7 +213,7 @@ def read_4dgs(path: Path) -> MovingFile:
     quats, scales = np.roll(g.rotations, 1, axis=1).astype(np.float32), g.scales.astype(np.float32)  # xyzw to wxyz
 
     def sample(t: float) -> Gaussians[Floats]:
-        now = g.state_at(min(t, _LAST) * seconds)
+        now = g.state_at(min(t, 1 - 1e-6) * seconds)  # at the very end its last pieces are gone
         means, opacities = g.positions.astype(np.float32), np.zeros(len(quats), np.float32)
         means[now["indices"]], opacities[now["indices"]] = now["centers"], now["opacity"]
         return Gaussians(means, quats, scales, opacities, sh)

@@ -20,34 +20,25 @@ _FIXED = imgui.WindowFlags_.no_move | imgui.WindowFlags_.no_resize | imgui.Windo
 _BAR = _FIXED | imgui.WindowFlags_.no_title_bar | imgui.WindowFlags_.no_scrollbar
 _FITTING = imgui.WindowFlags_.always_auto_resize
 _GAP = 8.0
-_BAR_HEIGHT = 62.0  # of the time slider
-_SIDE = 230.0  # width of the panel at the left
 _ACCENT = (0.95, 0.60, 0.25, 1.0)
 
 
-class _Renderer(ImguiRenderer):
-    """A button goes down where its event says: a finger is there without a move."""
-
-    def _on_mouse(self, event: dict[str, Any]) -> None:
-        self.backend.io.add_mouse_pos_event(event["x"], event["y"])
-        super()._on_mouse(event)
-
-
-class Panels:
-    """Draws the GUI of a ViewState onto the viewport's canvas."""
+class Panels(ImguiRenderer):
+    """The GUI of a ViewState, which `render` draws over what the viewport's canvas shows."""
 
     def __init__(self, state: ViewState, viewport: Viewport) -> None:
+        super().__init__(viewport.device.wgpu_device, viewport.canvas, viewport.format)
         self.state, self.viewport = state, viewport
         self._covered: list[tuple[float, float, float, float]] = []
-        self._renderer = _Renderer(viewport.device.wgpu_device, viewport.canvas, viewport.format)
-        self._renderer.set_gui(self._draw)
+        self.set_gui(self._draw)
         imgui.get_io().set_ini_filename("")
         imgui.get_io().config_flags &= ~imgui.ConfigFlags_.nav_enable_keyboard  # the keys are the viewer's
         _style()
 
-    def render(self) -> None:
-        """Draw over what the canvas shows."""
-        self._renderer.render()
+    def _on_mouse(self, event: dict[str, Any]) -> None:
+        """A button goes down where its event says: a finger is there without a move."""
+        self.backend.io.add_mouse_pos_event(event["x"], event["y"])
+        super()._on_mouse(event)
 
     def covers(self, x: float, y: float) -> bool:
         """Whether a place on the canvas, logical pixels, lies under a panel. imgui itself knows this only from the
@@ -77,7 +68,7 @@ class Panels:
             state.show_help = bool(stays)
         if not state.show_panels:
             return
-        imgui.set_next_window_size((_SIDE, 0))
+        imgui.set_next_window_size((230, 0))
         with self._panel("View", (0.0, 0.0), _FIXED):
             self._view()
         if state.show_overlay and frame is not None:
@@ -85,7 +76,7 @@ class Panels:
             with self._panel("overlay", (1.0, 0.0), _BAR | _FITTING | imgui.WindowFlags_.no_nav):
                 self._overlay(frame)
         if state.show_transport:
-            imgui.set_next_window_size((self.viewport.canvas.get_logical_size()[0] - 2 * _GAP, _BAR_HEIGHT))
+            imgui.set_next_window_size((self.viewport.canvas.get_logical_size()[0] - 2 * _GAP, 62))
             with self._panel("transport", (0.0, 1.0), _BAR):
                 _time_slider(state)
 

@@ -17,8 +17,8 @@ class Viewport:
     """Draws a ViewState onto a canvas.
 
     format: of the canvas's texture. frame: the one on show, None before the first. scale: its resolution, share of
-    the canvas's; 1 is the full one. moved_at: when the view last changed, seconds of `time.perf_counter`; `refresh`
-    does not count. stale: the scene has changed since it was drawn.
+    the canvas's; 1 is the full one. moved_at: when the view last changed, seconds of `time.perf_counter`. stale: to be
+    set where the scene itself has changed, until it was drawn.
     """
 
     def __init__(self, canvas: Any, state: ViewState) -> None:
@@ -39,11 +39,6 @@ class Viewport:
     def at_rest(self) -> bool:
         """Whether the frame on show is final: of the full resolution."""
         return self.scale == 1 and self.frame is not None
-
-    def refresh(self) -> None:
-        """Draw again, because the scene itself has changed."""
-        self.stale = True
-        self.canvas.request_draw()
 
     def draw(self, now: float) -> None:
         """Draw the scene where something changed: at a lower resolution while it changes, in full once
