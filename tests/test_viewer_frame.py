@@ -67,7 +67,7 @@ def test_antialiased_is_switched_by_a_key(tmp_path: Path, device: Device, monkey
         now[0] += 1
         canvas.draw()
         pictures.append(planes(app.viewport.frame))
-        app.controls._on_key_down({"key": "X", "modifiers": []})
+        app._on_key_down({"key": "X", "modifiers": []})
     assert np.abs(pictures[0] - pictures[1]).max() > 0
 
 

@@ -1,11 +1,12 @@
-"""The interactive viewer: puts state, viewport, controls and panels together. It draws only what has changed."""
+"""The interactive viewer: puts state, viewport, mouse, keys and panels together. It draws only what has changed."""
 
+import math
 import time
 from collections.abc import Callable
 from typing import Any
 
 from lapgs_wgpu.errors import DeviceError
-from lapgs_wgpu.viewer.controls import Controls
+from lapgs_wgpu.viewer.controls import BY_KEY, ORBIT, ZOOM
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 from lapgs_wgpu.viewer.view_state import ViewState
 from lapgs_wgpu.viewer.viewport import SETTLED, Viewport
@@ -18,6 +19,7 @@ class App:
     """A viewer on a rendercanvas and its event loop.
 
     drawing_seconds: that the last draw took, GUI included. failed: what ended it, if the device did. end: called then.
+    pointer: its last position on the canvas, logical pixels.
     """
 
     def __init__(self, canvas: Any, loop: Any, scene: LoadedScene) -> None:
@@ -26,12 +28,18 @@ class App:
         self.viewport = Viewport(canvas, self.state)
         self._gui: Any = None  # created after the first frame, which does not wait for it
         self._gui_draws = _GUI_DRAWS
-        self.controls = Controls(self.state, self.viewport, covered=self._covered, wake=self._wake)
+        self.pointer = (0.0, 0.0)
+        self._dragging: str | None = None
         self._drawn_at, self._running = time.perf_counter(), False
         self.drawing_seconds = 0.0
         self.failed: DeviceError | None = None
         self.end: Callable[[], None] = canvas.close
         canvas.request_draw(self._draw)
+        pointer = ("pointer_down", "pointer_move", "pointer_up", "double_click", "wheel")
+        canvas.add_event_handler(self._on_pointer, *pointer)
+        canvas.add_event_handler(self._on_key_down, "key_down")
+        # Panels react to everything, so everything asks for a draw; what has not changed is only presented again.
+        canvas.add_event_handler(self._wake, *pointer, "key_down", "key_up", "char", "resize", order=-100)
 
     def _draw(self) -> None:
         try:
@@ -61,9 +69,38 @@ class App:
             self.loop.call_later(SETTLED, self.canvas.request_draw)
         self.drawing_seconds = time.perf_counter() - now
 
-    def _wake(self) -> None:
+    def _wake(self, event: dict[str, Any]) -> None:
         self._gui_draws = _GUI_DRAWS
         self.canvas.request_draw()
 
-    def _covered(self, x: float, y: float) -> bool:
-        return self._gui is not None and self._gui.covers(x, y)
+    def _on_key_down(self, event: dict[str, Any]) -> None:
+        name = event["key"].lower() if len(event["key"]) == 1 else event["key"]  # letters without Shift
+        key = BY_KEY.get(name) if "Control" not in event["modifiers"] else None
+        if key is None:
+            return
+        if key.action == "focus":
+            self.viewport.focus(*self.pointer)
+        elif key.do is not None:
+            key.do(self.state)
+        else:
+            setattr(self.state, key.action, not getattr(self.state, key.action))
+
+    def _on_pointer(self, event: dict[str, Any]) -> None:
+        (x, y), last = (event["x"], event["y"]), self.pointer
+        self.pointer = (x, y)
+        kind, camera = event["event_type"], self.state.camera
+        if kind == "pointer_up":
+            self._dragging = None
+        elif kind == "pointer_move" and self._dragging == "orbit":
+            camera.orbit(ORBIT * (x - last[0]), ORBIT * (y - last[1]))
+        elif kind == "pointer_move" and self._dragging == "pan":
+            height = self.canvas.get_logical_size()[1]
+            camera.pan((x - last[0]) / height, (y - last[1]) / height)
+        elif kind == "pointer_move" or (self._gui and self._gui.covers(x, y)):
+            return
+        elif kind == "pointer_down":
+            self._dragging = "pan" if event["button"] != 1 or "Shift" in event["modifiers"] else "orbit"
+        elif kind == "double_click":
+            self.viewport.focus(x, y)
+        else:
+            camera.zoom(math.exp(ZOOM * event["dy"]))

@@ -1,6 +1,5 @@
 """Time in the clip while it plays."""
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -71,7 +70,6 @@ class Clock:
             self.playing = self.time < 1.0
         else:
             # Folded back at both ends: a place on a circle of twice the clip's length.
-            place = (self.time if self.forward else 2.0 - self.time) + way
-            place = math.fmod(place, 2.0)
+            place = ((self.time if self.forward else 2.0 - self.time) + way) % 2.0
             self.forward = place < 1.0
             self.time = place if self.forward else 2.0 - place

@@ -1,11 +1,9 @@
-"""Mouse and keyboard: what is handled, and what the help shows."""
+"""Mouse and keyboard: what keys do, and what the help shows."""
 
-import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from lapgs_wgpu.viewer.view_state import ViewState
-from lapgs_wgpu.viewer.viewport import Viewport
 
 
 class KeyBinding(NamedTuple):
@@ -50,59 +48,6 @@ MOUSE = (
     ("wheel", "nearer or farther"),
     ("double click", "turn about what lies there"),
 )
-_BY_KEY = {key.key: key for key in KEYS} | {"/": KEYS[-1]}  # "?" may arrive as "/" with Shift
+BY_KEY = {key.key: key for key in KEYS} | {"/": KEYS[-1]}  # "?" may arrive as "/" with Shift
 ORBIT = 0.008  # radians a pixel of dragging
 ZOOM = 0.0015  # of the distance's logarithm a pixel of the wheel
-
-
-class Controls:
-    """Handles the canvas's events. pointer: its last position on the canvas, logical pixels.
-
-    covered: whether a point of the canvas lies under a panel. wake: draw the canvas and its panels again.
-    """
-
-    def __init__(
-        self, state: ViewState, viewport: Viewport, *, covered: Callable[[float, float], bool], wake: Callable[[], None]
-    ) -> None:
-        self.state, self.viewport = state, viewport
-        self._covered = covered
-        self.pointer = (0.0, 0.0)
-        self._dragging: str | None = None
-        listen = viewport.canvas.add_event_handler
-        pointer = ("pointer_down", "pointer_move", "pointer_up", "double_click", "wheel")
-        listen(self._on_pointer, *pointer)
-        listen(self._on_key_down, "key_down")
-        # Panels react to everything, so everything asks for a draw; what has not changed is only presented again.
-        listen(lambda event: wake(), *pointer, "key_down", "key_up", "char", "resize", order=-100)
-
-    def _on_key_down(self, event: dict[str, Any]) -> None:
-        name = event["key"].lower() if len(event["key"]) == 1 else event["key"]  # letters without Shift
-        key = _BY_KEY.get(name) if "Control" not in event["modifiers"] else None
-        if key is None:
-            return
-        if key.action == "focus":
-            self.viewport.focus(*self.pointer)
-        elif key.do is not None:
-            key.do(self.state)
-        else:
-            setattr(self.state, key.action, not getattr(self.state, key.action))
-
-    def _on_pointer(self, event: dict[str, Any]) -> None:
-        (x, y), last = (event["x"], event["y"]), self.pointer
-        self.pointer = (x, y)
-        kind, camera = event["event_type"], self.state.camera
-        if kind == "pointer_up":
-            self._dragging = None
-        elif kind == "pointer_move" and self._dragging == "orbit":
-            camera.orbit(ORBIT * (x - last[0]), ORBIT * (y - last[1]))
-        elif kind == "pointer_move" and self._dragging == "pan":
-            height = self.viewport.canvas.get_logical_size()[1]
-            camera.pan((x - last[0]) / height, (y - last[1]) / height)
-        elif kind == "pointer_move" or self._covered(x, y):
-            return
-        elif kind == "pointer_down":
-            self._dragging = "pan" if event["button"] != 1 or "Shift" in event["modifiers"] else "orbit"
-        elif kind == "double_click":
-            self.viewport.focus(x, y)
-        else:
-            camera.zoom(math.exp(ZOOM * event["dy"]))

@@ -19,10 +19,6 @@ from lapgs_wgpu.viewer.moving_files import MANIFEST, SampledPlayback, read_seque
 from lapgs_wgpu.viewer.offscreen import OffscreenRenderer
 from lapgs_wgpu.viewer.web_page import page_html
 
-_POSTER_SIZE = (960, 540)
-_ENOUGH = 45.0  # dB of a compact scene; trained ones have some 55 in the usual steps
-_FINER = (1.0, 1 / 8, 1 / 64, 1 / 512)  # factors of the largest errors, tried one after the other
-
 
 def check_free(scene: LoadedScene, file: Path, overwrite: bool) -> None:
     """Raises InputError where a file must not be written: over the opened one, or another without `overwrite`."""
@@ -84,7 +80,7 @@ def export_compact(scene: LoadedScene, file: Path) -> Loss:
     with atomic_write(file) as target:  # before a minute of work
         content, loss = _compact(scene, scene.file)
         if file.suffix.lower() == ".html":
-            poster = OffscreenRenderer(scene)(scene.camera().camera(*_POSTER_SIZE), 0.0)
+            poster = OffscreenRenderer(scene)(scene.camera().camera(960, 540), 0.0)
             content = page_html(content, file.stem, poster, narrowest=scene.initial_view.narrowest).encode()
         target.write(content)
     return loss
@@ -96,12 +92,12 @@ def _compact(scene: LoadedScene, opened: SceneFile) -> tuple[bytes, Loss]:
     features = scene.playback.static_features() if isinstance(scene.playback, DevicePlayback) else None
     rows = held_rows(file.gaussians["opacity_logits"], file.field_config)
     best = b"", Loss(-np.inf, "")
-    for finer in _FINER:
+    for finer in (1.0, 1 / 8, 1 / 64, 1 / 512):  # factors of the largest errors
         content = compact_bytes(file, features, finer=finer)
         written = playback_of(read_compact(content, file.path), scene.playback.device)
         loss = measure(scene, written, rows)
         if loss.psnr > best[1].psnr + 1:
             best = content, loss
-        if loss.psnr >= _ENOUGH:
+        if loss.psnr >= 45.0:  # trained scenes have some 55 in the usual steps
             break
     return best

@@ -16,9 +16,6 @@ from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 Floats = NDArray[np.floating]
 Rows = NDArray[np.integer]
 
-_PICTURES = 4
-_VISIBLE = 40.0  # dB; below it a file has lost what is seen
-
 
 class Loss(NamedTuple):
     """psnr: of the worst image, dB, at most 100. reason: which Gaussians differ; empty where the loss is not seen."""
@@ -35,40 +32,33 @@ def measure(
     time: float | None = None,
     frames: int | None = None,
 ) -> Loss:
-    """Compare pictures of the captured images' size from around the focus.
+    """Compare four pictures of the captured images' size from around the focus; below 40 dB a loss is seen.
 
     written: the opened file. rows: which of the scene's Gaussians each of its is, where they are not the same.
     time: of all, in [0, 1]; by default from the clip's start to its end. frames: of a sequence, whose times the
     pictures have then.
     """
-    rasterizer = Rasterizer(scene.playback.device)
-
-    def drawn(playback: Playback, camera: Camera, t: float) -> Floats:
-        """An image (3, height, width), clipped to [0, 1]."""
-        return rasterizer.draw_whole(playback.at(t), camera, scene.background).image.read()[:3].clip(0, 1)
-
-    pictures = []
-    for camera, t in scene.around(_PICTURES, time):
+    rasterizer, pictures = Rasterizer(scene.playback.device), []
+    for camera, t in scene.around(4, time):
         t = t if frames is None else round(t * (frames - 1)) / max(1, frames - 1)
-        pictures.append((_psnr(drawn(scene.playback, camera, t), drawn(written, camera, t)), camera, t))
+        true, found = (
+            rasterizer.draw_whole(playback.at(t), camera, scene.background).image.read()[:3].clip(0, 1)
+            for playback in (scene.playback, written)
+        )
+        error = float(np.mean((found.astype(np.float64) - true) ** 2))
+        pictures.append((min(100.0, -10 * math.log10(max(error, 1e-20))), camera, t))
     psnr, camera, t = min(pictures, key=lambda picture: picture[0])
-    if psnr >= _VISIBLE:
-        return Loss(psnr, "")
-    return Loss(psnr, _reason(scene, written, np.arange(written.count) if rows is None else rows, camera, t))
+    return Loss(psnr, "" if psnr >= 40.0 else _reason(scene, written, rows, camera, t))
 
 
-def _psnr(true: Floats, found: Floats) -> float:
-    error = float(np.mean((found.astype(np.float64) - true) ** 2))
-    return min(100.0, -10 * math.log10(max(error, 1e-20)))
-
-
-def _reason(scene: LoadedScene, written: Playback, rows: Rows, camera: Camera, t: float) -> str:
+def _reason(scene: LoadedScene, written: Playback, rows: Rows | None, camera: Camera, t: float) -> str:
     """How many Gaussians, of those that the file shows at a time, differ from the scene's, and in what."""
     shown, exact = written.at(t), scene.playback.at(t)
     found = {name: array.read() for name, array in shown.arrays().items()}
-    there = found["opacities"] > 0
+    there = np.flatnonzero(found["opacities"] > 0)
     found = {name: values[there] for name, values in found.items()}
-    true = {name: array.read()[rows[there]] for name, array in exact.arrays().items()}
+    sources = there if rows is None else rows[there]
+    true = {name: array.read()[sources] for name, array in exact.arrays().items()}
     away = np.linalg.norm(true["means"] - found["means"], axis=1)
     lengths = np.linalg.norm(true["quats"], axis=1) * np.linalg.norm(found["quats"], axis=1)
     cosine = np.abs((true["quats"] * found["quats"]).sum(axis=1)) / lengths

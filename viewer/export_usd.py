@@ -14,7 +14,7 @@ from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.progress import counted
 from lapgs_wgpu.viewer.export_loss import Loss, measure
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene, direction, nearest_axis
-from lapgs_wgpu.viewer.moving_files import SampledPlayback, load_pxr, read_usd
+from lapgs_wgpu.viewer.moving_files import USD_DEGREE, USD_HARMONICS, USD_KIND, SampledPlayback, load_pxr, read_usd
 from lapgs_wgpu.viewer.plain_opacity import plain_factors
 
 Floats = NDArray[np.float32]
@@ -59,30 +59,23 @@ def _write(pxr: Any, stage: Any, scene: LoadedScene, frames: int) -> None:
     upright = pxr.Gf.Matrix4d().SetRotate(pxr.Gf.Rotation(up, above))
     world.AddTransformOp().Set(upright)
     _write_camera(pxr, stage, scene, upright)
-    splats = pxr.UsdVol.ParticleField3DGaussianSplat.Define(stage, "/World/Splats")
-    pxr.Usd.ColorSpaceAPI.Apply(splats.GetPrim()).CreateColorSpaceNameAttr("srgb_rec709_display")
-    splats.CreateRadianceSphericalHarmonicsDegreeAttr(scene.playback.at(0.0).sh_degree)
-    attributes = {
-        "positions": splats.CreatePositionsAttr(),
-        "orientations": splats.CreateOrientationsAttr(),
-        "scales": splats.CreateScalesAttr(),
-        "opacities": splats.CreateOpacitiesAttr(),
-        "harmonics": splats.CreateRadianceSphericalHarmonicsCoefficientsAttr(),
-        "extent": splats.CreateExtentAttr(),
-    }
+    splats = stage.DefinePrim("/World/Splats", USD_KIND)
+    pxr.Usd.ColorSpaceAPI.Apply(splats).CreateColorSpaceNameAttr("srgb_rec709_display")
+    splats.GetAttribute(USD_DEGREE).Set(scene.playback.at(0.0).sh_degree)
     factors = plain_factors(scene).astype(np.float32)
     last: dict[str, Floats] = {}  # what was written
     for number, t in enumerate(counted(np.linspace(0, 1, frames).tolist(), frames, "frames")):
         for name, values in _values(scene, t, factors).items():
+            attribute = splats.GetAttribute(name)
             if name not in last:
-                attributes[name].Set(_vt(pxr, values))  # for programs that ask for no time
+                attribute.Set(values)  # for programs that ask for no time
             else:
                 if name == "orientations":  # -q turns as q does, but not what lies between frames
                     values[(values * last[name]).sum(axis=1) < 0] *= -1
                 if np.array_equal(values, last[name]):
                     continue
-                attributes[name].Set(_vt(pxr, last[name]), number - 1)  # until then it stood still
-            attributes[name].Set(_vt(pxr, values), number)
+                attribute.Set(last[name], number - 1)  # until then it stood still
+            attribute.Set(values, number)
             last[name] = values
 
 
@@ -90,22 +83,16 @@ def _values(scene: LoadedScene, t: float, factors: Floats) -> dict[str, Floats]:
     """The attributes' values at a time. factors: (N,) of the opacities."""
     now = scene.playback.at(t)
     means, quats, scales, opacities, sh = read_all([now.means, now.quats, now.scales, now.opacities, now.sh])
+    unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
     reach = 3 * scales.max(axis=1, keepdims=True)
     return {
         "positions": means,
-        "orientations": quats / np.linalg.norm(quats, axis=1, keepdims=True),
+        "orientations": np.roll(unit, -1, axis=1),  # the real part is last in memory
         "scales": scales,
         "opacities": factors * opacities,
-        "harmonics": sh.reshape(-1, 3),
+        USD_HARMONICS: sh.reshape(-1, 3),
         "extent": np.stack([(means - reach).min(axis=0), (means + reach).max(axis=0)]),
     }
-
-
-def _vt(pxr: Any, values: Floats) -> Any:
-    if values.shape[-1] == 4 and values.ndim == 2:  # quaternions, whose real part is last in memory
-        return pxr.Vt.QuatfArray.FromNumpy(np.ascontiguousarray(np.roll(values, -1, axis=1)))
-    kind = pxr.Vt.FloatArray if values.ndim == 1 else pxr.Vt.Vec3fArray
-    return kind.FromNumpy(np.ascontiguousarray(values))
 
 
 def _write_camera(pxr: Any, stage: Any, scene: LoadedScene, upright: Any) -> None:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,8 +12,6 @@ from lapgs_wgpu.motion.playback.playback import Playback
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.viewer.render_modes import MODES, Mode
-
-_TIMES = 9  # of the clip, at which the Gaussians' places are compared
 
 
 class FrameRequest(NamedTuple):
@@ -26,8 +24,7 @@ class FrameRequest(NamedTuple):
     antialiased: bool | None = None
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Frame:
+class Frame(NamedTuple):
     """A drawn frame.
 
     planes: as the rasterizer draws them, (4 or 5, height, width). low, high: the values at the ends of the scale, for
@@ -43,17 +40,17 @@ class Frame:
 
 
 class FrameRenderer:
-    """Draws frames of one scene with buffers of its own; a frame is valid until the next one is drawn."""
+    """Draws frames of one scene with buffers of its own; a frame is valid until the next one is drawn.
+
+    moved: how far each Gaussian moves, as colors (N, 3), and the distance at the end of the scale; None before it is
+    measured, and to be set where the scene has changed.
+    """
 
     def __init__(self, playback: Playback) -> None:
         self.playback = playback
         self._rasterizer = Rasterizer(playback.device)
         self._pool = BufferPool(playback.device)
-        self._moved: tuple[DeviceArray, float] | None = None
-
-    def forget(self) -> None:
-        """Drop what was measured of the scene, because it has changed."""
-        self._moved = None
+        self.moved: tuple[DeviceArray, float] | None = None
 
     def modes(self) -> list[Mode]:
         """List the modes in which this scene has something to show."""
@@ -62,37 +59,26 @@ class FrameRenderer:
     def draw(self, request: FrameRequest) -> Frame:
         """Draw, and wait until it is done."""
         start = time.perf_counter()
-        camera, mode = request.camera, request.mode
         low, high, background = 0.0, 1.0, request.background
-        colors = None
-        if mode == "motion":  # before the Gaussians, which measuring takes to other times
-            colors, high = self._motion()
+        changes: dict[str, Any] = {} if request.antialiased is None else {"antialiased": request.antialiased}
+        if request.mode == "motion":  # before the Gaussians, which measuring takes to other times
+            self.moved = self.moved or self._measure_motion()
+            changes["sh"], high = self.moved
             background = (0.0, 0.0, 0.0)
-        gaussians = self.playback.at(request.time)
-        if request.antialiased is not None:
-            gaussians = dataclasses.replace(gaussians, antialiased=request.antialiased)
-        if colors is not None:
-            gaussians = dataclasses.replace(gaussians, sh=colors)
-        drawing = self._rasterizer.draw_whole(gaussians, camera, background, depth=mode == "depth")
+        gaussians = dataclasses.replace(self.playback.at(request.time), **changes)
+        depths = request.mode == "depth"
+        drawing = self._rasterizer.draw_whole(gaussians, request.camera, background, depth=depths)
         splats = int(drawing.lists.visible.read()[0])
-        if mode == "depth":
+        if depths:
             rest, depth = drawing.image.read()[3:]
             seen = rest < 0.5
             if seen.any():
                 low, high = np.percentile(depth[seen] / (1.0 - rest[seen]), [1, 99]).tolist()
         return Frame(request, drawing.image, low, high, time.perf_counter() - start, splats)
 
-    def depth_at(self, frame: Frame, column: int, row: int) -> float | None:
-        """Measure the depth along the camera's axis at a pixel, world units; None where it shows next to nothing."""
-        planes = self.draw(frame.request._replace(mode="depth")).planes.read()
-        alpha = 1.0 - float(planes[3, row, column])
-        return float(planes[4, row, column]) / alpha if alpha > 0.1 else None
-
-    def _motion(self) -> tuple[DeviceArray, float]:
-        """Return how far each Gaussian moves as its color (N, 3), and the distance at the end of the scale."""
-        if self._moved is None:
-            places = np.stack([self.playback.at(t).means.read() for t in np.linspace(0, 1, _TIMES)])
-            moved = np.linalg.norm(places - places.mean(axis=0), axis=2).max(axis=0).astype(np.float32)
-            array = self._pool.upload("motion", np.repeat(moved[:, None], 3, axis=1))
-            self._moved = array, max(float(np.percentile(moved, 98)) if len(moved) else 1.0, 1e-9)
-        return self._moved
+    def _measure_motion(self) -> tuple[DeviceArray, float]:
+        """Compare the Gaussians' places at nine times of the clip."""
+        places = np.stack([self.playback.at(t).means.read() for t in np.linspace(0, 1, 9)])
+        moved = np.linalg.norm(places - places.mean(axis=0), axis=2).max(axis=0).astype(np.float32)
+        colors = self._pool.upload("motion", np.repeat(moved[:, None], 3, axis=1))
+        return colors, max(float(np.percentile(moved, 98)) if len(moved) else 1.0, 1e-9)

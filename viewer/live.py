@@ -55,20 +55,19 @@ def watch(path: Path, scene: Scene4D, initial_view: InitialView, steps: Iterator
                 await sleep(_PATIENCE)
                 continue
             try:
-                progress = next(steps, None)
+                training.last = next(steps)
+            except StopIteration:  # done, or interrupted: what follows must not wait for somebody to close the window
+                break
             except Exception as error:  # the window's loop would log it and go on
                 failed.append(error)
-                progress = None
-            if progress is None:  # done, or interrupted: what follows must not wait for somebody to close the window
-                canvas.close()
-                return
-            training.last = progress
+                break
             training.single = max(0, training.single - 1)
             now = time.perf_counter()
             if training.paused or (not viewport.stale and now - pictured > app.drawing_seconds / SHARE):
-                viewport.refresh()
-                pictured = now
+                viewport.stale, pictured = True, now
+                canvas.request_draw()
             await sleep(0.0)
+        canvas.close()
 
     loop.add_task(drive)
     loop.run()

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from lapgs_wgpu.data import View
 
 _ELEVATION = math.radians(35)  # of the guessed camera above the middle
-_FLAT = 0.5  # of the extents along x and y: what is lower lies on the ground
-_FRAMES = 150  # of a clip whose file does not say how many it has
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -99,12 +97,11 @@ def load_scene(
     are drawn; both otherwise as the file says.
     """
     playback: Playback
-    if path.is_dir():
-        stills = list(path.glob("*.ply"))
-        if (path / MANIFEST).is_file():
-            path = path / MANIFEST
-        elif len(stills) == 1:
-            path = stills[0]
+    stills = list(path.glob("*.ply"))  # none where it is a file
+    if (path / MANIFEST).is_file():
+        path = path / MANIFEST
+    elif len(stills) == 1:
+        path = stills[0]
     moving, file = open_moving(path), None
     if moving is not None:
         playback, frames = SampledPlayback(device(), moving, antialiased), moving.frames
@@ -113,11 +110,9 @@ def load_scene(
         if antialiased is not None:
             file = dataclasses.replace(file, antialiased=antialiased)
         playback, frames = playback_of(file, device()), None
-    initial_view = InitialView.from_json(playback.metadata.get("view", ""))
-    if initial_view is None or up is not None:
-        frames = frames or (initial_view.frames if initial_view else None)
-        initial_view = guess_view(playback, up or playback.metadata.get("up"))
-    return LoadedScene(path, playback, initial_view._replace(frames=frames or initial_view.frames), file)
+    stored = InitialView.from_json(playback.metadata.get("view", ""))
+    view = stored if stored and up is None else guess_view(playback, up or playback.metadata.get("up"))
+    return LoadedScene(path, playback, view._replace(frames=frames or (stored or view).frames), file)
 
 
 def guess_view(playback: Playback, axis: str | None = None) -> InitialView:
@@ -133,11 +128,11 @@ def guess_view(playback: Playback, axis: str | None = None) -> InitialView:
     radius = max(float(np.quantile(np.linalg.norm(means - middle, axis=1), 0.9)), 1e-3)
     extent = np.subtract(*np.quantile(means, [0.9, 0.1], axis=0))
     if axis not in AHEAD:
-        axis = "z" if extent[2] < _FLAT * min(extent[0], extent[1]) else "-y"
+        axis = "z" if extent[2] < 0.5 * min(extent[0], extent[1]) else "-y"
     up, ahead = direction(axis), direction(AHEAD[axis])
     away = math.sin(_ELEVATION) * up - math.cos(_ELEVATION) * ahead
     camera = Camera.looking_at(middle + 3.6 * radius * away, middle, up=up.tolist(), fov_x=0.9, width=640, height=480)
-    return InitialView(camera, middle, up, _FRAMES)
+    return InitialView(camera, middle, up, frames=150)
 
 
 def direction(axis: str) -> NDArray[np.float64]:

@@ -32,9 +32,8 @@ from lapgs_wgpu.viewer.options import USD
 Floats = NDArray[np.float32]
 MANIFEST = "sequence.json"
 SH_RANGE = 4.0  # of .4dgs: a coefficient is a byte from -this to +this (section 6.5 of the specification)
-_USD_KIND = "ParticleField3DGaussianSplat"
-_LAST = 1 - 1e-6  # time in the clip of a .4dgs at which its last pieces are still there
-_SPLATV = 0x674B  # the first word of a .splatv
+USD_KIND = "ParticleField3DGaussianSplat"
+USD_DEGREE, USD_HARMONICS = "radiance:sphericalHarmonicsDegree", "radiance:sphericalHarmonicsCoefficients"
 AXES = ("x", "y", "z", "-x", "-y", "-z")  # as .4dgs numbers them
 _POLYNOMIAL = [
     "x", "y", "z", *(f"motion_{i}" for i in range(9)), *(f"rot_{i}" for i in range(4)),
@@ -112,11 +111,10 @@ def read_frames(files: list[Path], metadata: dict[str, str]) -> MovingFile:
     @lru_cache(maxsize=4)
     def frame(number: int) -> Gaussians[Floats]:
         file = read_scene(files[number])
-        now = activate(file.gaussians, first.sh_degree)
-        present = np.arange(max(counts)) < len(now["means"])
-        rows = np.where(present, np.arange(max(counts)), 0)
+        now, rows = activate(file.gaussians, first.sh_degree), np.arange(max(counts))
+        present = rows < len(now["means"])
         names = ("means", "quats", "scales", "opacities", "sh")
-        means, quats, scales, opacities, sh = (now[name][rows] for name in names)
+        means, quats, scales, opacities, sh = (now[name][rows * present] for name in names)
         means += (_offset(file) - start).astype(np.float32)
         return Gaussians(means, quats, scales, opacities * present, sh, antialiased=file.antialiased)
 
@@ -135,23 +133,19 @@ def read_spacetime_ply(path: Path) -> MovingFile | None:
         if vertex is None or not set(_POLYNOMIAL) <= vertex.properties.keys():
             return None
         values = ply.columns(vertex, _POLYNOMIAL)
-        decoded = "f_dc_3" in vertex.properties
-    means, motion, quats, omega, scales, opacity, colors, time = np.split(values, [3, 12, 16, 20, 23, 24, 27], axis=1)
-    if decoded:  # features: the first three are the color that the network beside the file adds to
-        print(
-            f"note: {path}: its colors come from a network beside it; shown are those that it adds to.", file=sys.stderr
-        )
+    moving, scales, opacities, colors, center, width = np.split(values, [20, 23, 24, 27, 28], axis=1)
+    if "f_dc_3" in vertex.properties:  # features: the first three are the color that the network adds to
+        note = "its colors come from a network beside it; shown are those that it adds to."
+        print(f"note: {path}: {note}", file=sys.stderr)
         colors = _sigmoid(colors)
-    scales, width = np.exp(scales), np.exp(time[:, 1])
-    opacities = _sigmoid(opacity[:, 0])
-    return _polynomial(path, means, motion, quats, omega, scales, opacities, colors, time[:, 0], width, {})
+    return _polynomial(path, [moving, np.exp(scales), _sigmoid(opacities), colors, center, np.exp(width)], {})
 
 
 def read_splatv(path: Path) -> MovingFile:
     """The same in halves and bytes, 64 of them a Gaussian, behind a list of parts in JSON (antimatter15/splaTV)."""
     data = path.read_bytes()
     magic, length = struct.unpack("<II", data[:8].ljust(8, b"\0"))
-    if magic != _SPLATV or 8 + length > len(data):
+    if magic != 0x674B or 8 + length > len(data):
         raise InputError(f"{path}: begins with {data[:4]!r} and has {len(data)} bytes; it is no whole .splatv.")
     parts, begin = parse_json(data[8 : 8 + length].decode(errors="replace"), str(path)), 8 + length
     try:
@@ -165,10 +159,9 @@ def read_splatv(path: Path) -> MovingFile:
     words = words[words[:, 7] >> 24 > 0]  # rows that pad the texture are invisible
     halves = words.view("<f2").astype(np.float32)
     rgba = (words[:, 7:8].copy().view(np.uint8) / 255).astype(np.float32)
-    return _polynomial(
-        path, words[:, :3].copy().view("<f4"), halves[:, 16:25], halves[:, 6:10], halves[:, 26:30], halves[:, 10:13],
-        rgba[:, 3], rgba[:, :3], halves[:, 30], halves[:, 31], view,
-    )  # fmt: skip
+    motion, quats, omega, scales = halves[:, 16:25], halves[:, 6:10], halves[:, 26:30], halves[:, 10:13]
+    columns = [words[:, :3].copy().view("<f4"), motion, quats, omega, scales, rgba[:, 3], rgba[:, :3], halves[:, 30:]]
+    return _polynomial(path, columns, view)
 
 
 def _view(camera: dict[str, Any]) -> InitialView:
@@ -180,24 +173,23 @@ def _view(camera: dict[str, Any]) -> InitialView:
     return InitialView(start, position + 4 * R[:, 2], -R[:, 1], 150)
 
 
-def _polynomial(
-    path: Path, means: Floats, motion: Floats, quats: Floats, omega: Floats, scales: Floats, opacities: Floats,
-    colors: Floats, center: Floats, width: Floats, metadata: dict[str, str],
-) -> MovingFile:  # fmt: skip
-    """motion: (N, 9) by the powers of time since `center`. omega: (N, 4) change of quats a clip. width: of the bell."""
-    values = np.column_stack([means, motion, quats, omega, scales, opacities, colors, center, width])
+def _polynomial(path: Path, columns: list[Floats], metadata: dict[str, str]) -> MovingFile:
+    """columns: of the values of _POLYNOMIAL, activated. Motion is by powers of the time since the bell's center."""
+    values = np.column_stack(columns)
     bad = int((~np.isfinite(values).all(axis=1)).sum())
     if bad or not len(values):
         raise InputError(f"{path}: {bad} of its {len(values)} visible Gaussians hold NaN or infinity; export it again.")
+    parts = np.split(values, [3, 12, 16, 20, 23, 24, 27, 28], axis=1)
+    means, motion, quats, omega, scales, opacities, colors, center, width = parts
     sh = ((colors - np.float32(0.5)) / np.float32(CONSTANTS["SH_C0"]))[:, None]
     scales = np.maximum(scales, np.float32(1e-7))
 
     def sample(t: float) -> Gaussians[Floats]:
-        since = (np.float32(t) - center)[:, None]
+        since = np.float32(t) - center
         powers = np.concatenate([since, since**2, since**3], axis=1)
         moved = means + np.einsum("np,npc->nc", powers, motion.reshape(-1, 3, 3))
-        fade = np.exp(-((since[:, 0] / np.maximum(width, np.float32(1e-6))) ** 2))
-        return Gaussians(moved, quats + since * omega, scales, opacities * fade, sh)
+        fade = np.exp(-((since / np.maximum(width, np.float32(1e-6))) ** 2))
+        return Gaussians(moved, quats + since * omega, scales, (opacities * fade)[:, 0], sh)
 
     return MovingFile(sample, None, metadata)
 
@@ -221,7 +213,7 @@ def read_4dgs(path: Path) -> MovingFile:
     quats, scales = np.roll(g.rotations, 1, axis=1).astype(np.float32), g.scales.astype(np.float32)  # xyzw to wxyz
 
     def sample(t: float) -> Gaussians[Floats]:
-        now = g.state_at(min(t, _LAST) * seconds)
+        now = g.state_at(min(t, 1 - 1e-6) * seconds)  # at the very end its last pieces are gone
         means, opacities = g.positions.astype(np.float32), np.zeros(len(quats), np.float32)
         means[now["indices"]], opacities[now["indices"]] = now["centers"], now["opacity"]
         return Gaussians(means, quats, scales, opacities, sh)
@@ -239,21 +231,19 @@ def read_usd(path: Path) -> MovingFile:
         stage = pxr.Usd.Stage.Open(str(path))
     except pxr.Tf.ErrorException as error:
         raise InputError(f"{path}: usd-core cannot open it ({str(error).splitlines()[0][:200]}).") from None
-    prim = next((prim for prim in stage.Traverse() if prim.GetTypeName() == _USD_KIND), None)
+    prim = next((prim for prim in stage.Traverse() if prim.GetTypeName() == USD_KIND), None)
     if prim is None:
-        raise InputError(f"{path}: holds no prim of the type {_USD_KIND} (OpenUSD 26.03); other splats are not read.")
+        raise InputError(f"{path}: holds no prim of the type {USD_KIND} (OpenUSD 26.03); other splats are not read.")
     start, end = stage.GetStartTimeCode(), stage.GetEndTimeCode()
-    degree = int(prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get() or 0)
+    degree = int(prim.GetAttribute(USD_DEGREE).Get() or 0)
 
     def get(name: str, code: float) -> Floats:
-        values = prim.GetAttribute(name).Get(code)
-        if values is None:
-            values = prim.GetAttribute(f"{name}h").Get(code)  # in half precision
-        return np.array(values if values is not None else [], np.float32)
+        stored = (prim.GetAttribute(each).Get(code) for each in (name, f"{name}h"))  # h: in half precision
+        return np.array(next((values for values in stored if values is not None), []), np.float32)
 
     count = len(get("positions", start))
     shapes = {"positions": (count, 3), "orientations": (count, 4), "scales": (count, 3), "opacities": (count,)}
-    shapes["radiance:sphericalHarmonicsCoefficients"] = (count * (degree + 1) ** 2, 3)
+    shapes[USD_HARMONICS] = (count * (degree + 1) ** 2, 3)
 
     def sample(t: float, stage: Any = stage) -> Gaussians[Floats]:  # without its stage a prim is empty
         found = {name: get(name, start + t * (end - start)) for name in shapes}

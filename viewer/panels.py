@@ -1,6 +1,7 @@
 """The GUI over the image (Dear ImGui): the view's panel, overlay, help."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, TypeVar
 
@@ -9,6 +10,7 @@ from wgpu.utils.imgui import ImguiRenderer
 
 from lapgs_wgpu.viewer.clock import LOOPS, SPEEDS
 from lapgs_wgpu.viewer.controls import KEYS, MOUSE
+from lapgs_wgpu.viewer.frame import Frame
 from lapgs_wgpu.viewer.render_modes import BACKGROUNDS, MODES
 from lapgs_wgpu.viewer.view_state import TrainingControl, ViewState
 from lapgs_wgpu.viewer.viewport import Viewport
@@ -16,95 +18,90 @@ from lapgs_wgpu.viewer.viewport import Viewport
 T = TypeVar("T")
 _FIXED = imgui.WindowFlags_.no_move | imgui.WindowFlags_.no_resize | imgui.WindowFlags_.no_saved_settings
 _BAR = _FIXED | imgui.WindowFlags_.no_title_bar | imgui.WindowFlags_.no_scrollbar
+_FITTING = imgui.WindowFlags_.always_auto_resize
 _GAP = 8.0
-_BAR_HEIGHT = 62.0  # of the time slider
-_SIDE = 230.0  # width of the panel at the left
 _ACCENT = (0.95, 0.60, 0.25, 1.0)
 
 
-class _Renderer(ImguiRenderer):
-    """A button goes down where its event says: a finger is there without a move."""
-
-    def _on_mouse(self, event: dict[str, Any]) -> None:
-        self.backend.io.add_mouse_pos_event(event["x"], event["y"])
-        super()._on_mouse(event)
-
-
-class Panels:
-    """Draws the GUI of a ViewState onto the viewport's canvas."""
+class Panels(ImguiRenderer):
+    """The GUI of a ViewState, which `render` draws over what the viewport's canvas shows."""
 
     def __init__(self, state: ViewState, viewport: Viewport) -> None:
+        super().__init__(viewport.device.wgpu_device, viewport.canvas, viewport.format)
         self.state, self.viewport = state, viewport
         self._covered: list[tuple[float, float, float, float]] = []
-        self._renderer = _Renderer(viewport.device.wgpu_device, viewport.canvas, viewport.format)
-        self._renderer.set_gui(self._draw)
+        self.set_gui(self._draw)
         imgui.get_io().set_ini_filename("")
         imgui.get_io().config_flags &= ~imgui.ConfigFlags_.nav_enable_keyboard  # the keys are the viewer's
         _style()
 
-    def render(self) -> None:
-        """Draw over what the canvas shows."""
-        self._renderer.render()
+    def _on_mouse(self, event: dict[str, Any]) -> None:
+        """A button goes down where its event says: a finger is there without a move."""
+        self.backend.io.add_mouse_pos_event(event["x"], event["y"])
+        super()._on_mouse(event)
 
     def covers(self, x: float, y: float) -> bool:
         """Whether a place on the canvas, logical pixels, lies under a panel. imgui itself knows this only from the
         next frame on."""
         return any(left <= x < right and top <= y < bottom for left, top, right, bottom in self._covered)
 
-    def _end(self) -> None:
-        """End a panel, and note where it lies."""
+    @contextmanager
+    def _panel(self, title: str, place: tuple[float, float], flags: int, closable: bool | None = None) -> Iterator[Any]:
+        """A panel, and a note of where it lies. Yields whether it stays open.
+
+        place: on the canvas, shares of its width and height; the panel's own point at these shares lies there.
+        """
+        sides = self.viewport.canvas.get_logical_size()
+        corner = tuple(_GAP + share * (side - 2 * _GAP) for share, side in zip(place, sides, strict=True))
+        imgui.set_next_window_pos(corner, imgui.Cond_.always, place)
+        yield imgui.begin(title, closable, flags)[1]
         (x, y), (width, height) = imgui.get_window_pos(), imgui.get_window_size()
         self._covered.append((x, y, x + width, y + height))
         imgui.end()
 
     def _draw(self) -> None:
-        state = self.state
+        state, frame = self.state, self.viewport.frame
         self._covered.clear()
         if state.show_help:
-            self._help()
+            with self._panel("Keys and mouse", (0.5, 0.5), _FIXED | _FITTING, closable=True) as stays:
+                _help()
+            state.show_help = bool(stays)
         if not state.show_panels:
             return
-        self._view()
-        if state.show_overlay:
-            self._overlay()
+        imgui.set_next_window_size((230, 0))
+        with self._panel("View", (0.0, 0.0), _FIXED):
+            self._view()
+        if state.show_overlay and frame is not None:
+            imgui.set_next_window_bg_alpha(0.6)
+            with self._panel("overlay", (1.0, 0.0), _BAR | _FITTING | imgui.WindowFlags_.no_nav):
+                self._overlay(frame)
         if state.show_transport:
-            width, height = self.viewport.canvas.get_logical_size()
-            imgui.set_next_window_pos((_GAP, height - _BAR_HEIGHT - _GAP))
-            imgui.set_next_window_size((width - 2 * _GAP, _BAR_HEIGHT))
-            imgui.begin("transport", None, _BAR)
-            _time_slider(state)
-            self._end()
-
-    # The panel at the left -------------------------------------------------------------------------------------------
+            imgui.set_next_window_size((self.viewport.canvas.get_logical_size()[0] - 2 * _GAP, 62))
+            with self._panel("transport", (0.0, 1.0), _BAR):
+                _time_slider(state)
 
     def _view(self) -> None:
-        state = self.state
-        imgui.set_next_window_pos((_GAP, _GAP))
-        imgui.set_next_window_size((_SIDE, 0))
-        imgui.begin("View", None, _FIXED)
+        """Fill the panel at the left."""
+        state, frame = self.state, self.viewport.frame
         state.mode = _choice("mode", state.mode, state.renderer.modes())
         _tip(MODES[state.mode])
-        frame = self.viewport.frame
         if frame is not None and frame.request.mode in ("depth", "motion"):
             imgui.text(f"dark {frame.low:.3g}, bright {frame.high:.3g}")
         state.background = _choice("ground", state.background, list(BACKGROUNDS.values()), list(BACKGROUNDS))
         _tip("background")
         _, state.antialiased = imgui.checkbox("antialiased", state.antialiased)
         _tip("Mip-Splatting's filter, as antialiased trainings draw (X)")
-        if _button("Reset"):
+        if _button("Reset", tip="camera back to where it started (R)"):
             state.camera.reset()
-        _tip("camera back to where it started (R)")
         imgui.same_line()
-        if _button("Help"):
+        if _button("Help", tip="keys and mouse (?)"):
             state.show_help = not state.show_help
-        _tip("keys and mouse (?)")
         if state.training is not None:
             self._training(state.training)
         if views := state.scene.views:
             chosen = _choice("camera", state.view, range(len(views)), [view.name for view in views])
             if chosen != state.view:
                 state.stand_at(chosen)
-        self._end()
 
     def _training(self, training: TrainingControl) -> None:
         imgui.separator_text("Training")
@@ -115,43 +112,26 @@ class Panels:
         if _button("Go on" if training.paused else "Pause"):
             self.state.toggle_pause()
         imgui.same_line()
-        if _button("Step"):
+        if _button("Step", tip="one step of the optimizer, then pause"):
             self.state.step_training()
-        _tip("one step of the optimizer, then pause")
 
-    # Texts over the picture ------------------------------------------------------------------------------------------
-
-    def _overlay(self) -> None:
-        state, viewport = self.state, self.viewport
-        if viewport.frame is None:
-            return
-        width, _ = viewport.canvas.get_logical_size()
-        imgui.set_next_window_pos((width - _GAP, _GAP), imgui.Cond_.always, (1.0, 0.0))
-        imgui.set_next_window_bg_alpha(0.6)
-        imgui.begin("overlay", None, _BAR | imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_nav)
-        frame, camera = viewport.frame, viewport.frame.request.camera
+    def _overlay(self, frame: Frame) -> None:
+        camera, scale = frame.request.camera, self.viewport.scale
         imgui.text(f"{1 / max(frame.seconds, 1e-4):.1f} frames a second   {1000 * frame.seconds:.1f} ms")
-        imgui.text(f"{frame.splats:,} of {state.scene.playback.count:,} splats")
-        imgui.text(
-            f"{camera.width}x{camera.height}" + (f" ({100 * viewport.scale:.0f} %)" if viewport.scale < 1 else "")
-        )
-        imgui.text(viewport.device.info.name[:34])
-        self._end()
+        imgui.text(f"{frame.splats:,} of {self.state.scene.playback.count:,} splats")
+        imgui.text(f"{camera.width}x{camera.height}" + (f" ({100 * scale:.0f} %)" if scale < 1 else ""))
+        imgui.text(self.viewport.device.info.name[:34])
 
-    def _help(self) -> None:
-        width, height = self.viewport.canvas.get_logical_size()
-        imgui.set_next_window_pos((0.5 * width, 0.5 * height), imgui.Cond_.always, (0.5, 0.5))
-        _, stays = imgui.begin("Keys and mouse", True, _FIXED | imgui.WindowFlags_.always_auto_resize)
-        if imgui.begin_table("keys", 2):
-            for shown, text in (*((key.shown, key.help) for key in KEYS), *MOUSE):
-                imgui.table_next_row()
-                imgui.table_next_column()
-                imgui.text_colored(_ACCENT, shown)
-                imgui.table_next_column()
-                imgui.text(text)
-            imgui.end_table()
-        self._end()
-        self.state.show_help = bool(stays)
+
+def _help() -> None:
+    if imgui.begin_table("keys", 2):
+        for shown, text in (*((key.shown, key.help) for key in KEYS), *MOUSE):
+            imgui.table_next_row()
+            imgui.table_next_column()
+            imgui.text_colored(_ACCENT, shown)
+            imgui.table_next_column()
+            imgui.text(text)
+        imgui.end_table()
 
 
 def _time_slider(state: ViewState) -> None:
@@ -208,8 +188,10 @@ def _style() -> None:
     style.set_color_(imgui.Col_.slider_grab_active, _ACCENT)
 
 
-def _button(label: str, width: float = 66) -> bool:
-    return bool(imgui.button(label, (width, 0)))
+def _button(label: str, width: float = 66, tip: str = "") -> bool:
+    pressed = bool(imgui.button(label, (width, 0)))
+    _tip(tip)
+    return pressed
 
 
 def _choice(label: str, present: T, choices: Sequence[T], names: Sequence[str] | None = None, width: float = -70) -> T:
@@ -220,5 +202,5 @@ def _choice(label: str, present: T, choices: Sequence[T], names: Sequence[str] |
 
 
 def _tip(text: str) -> None:
-    if imgui.is_item_hovered(imgui.HoveredFlags_.allow_when_disabled):
+    if text and imgui.is_item_hovered(imgui.HoveredFlags_.allow_when_disabled):
         imgui.set_tooltip(text)

@@ -9,20 +9,19 @@ from lapgs_wgpu.splat.constants import CONSTANTS
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 
 Floats = NDArray[np.floating]
-_VIEWS = 8  # around the focus, each at another time of the clip
 
 
 def plain_factors(scene: LoadedScene) -> Floats:
     """Return the factors (N,) of opacities with which plain drawing comes nearest to the scene's own.
 
     They are 1 where the scene is not antialiased. Antialiased drawing makes a splat as much fainter as the low-pass
-    filter makes it larger, which depends on its size in the image: here the median over views in the size of the
-    captured images, at the distance of the first of them.
+    filter makes it larger, which depends on its size in the image: here the median over eight views around the focus,
+    each at another time of the clip, in the size of the captured images and at the distance of the first of them.
     """
     if not scene.playback.at(0.0).antialiased:
         return np.ones(scene.playback.count)
     factors = []
-    for camera, t in scene.around(_VIEWS, None):
+    for camera, t in scene.around(8, None):
         now = scene.playback.at(t)
         means, quats, scales = read_all([now.means, now.quats, now.scales])
         factors.append(_faded(means, quats, scales, camera))

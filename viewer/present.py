@@ -45,8 +45,8 @@ class Presenter:
     def __call__(self, target: Any, size: tuple[int, int], frame: Frame) -> None:
         """Submit: the frame on all of `target`, a texture view of (width, height)."""
         request = frame.request
-        values: dict[str, object] = {f"heat{i}": (*color, 1.0) for i, color in enumerate(HEAT)}
-        values |= {
+        values = {
+            **{f"heat{i}": (*color, 1.0) for i, color in enumerate(HEAT)},
             "background": (*request.background, 1.0),
             "size": size,
             "picture": (request.camera.width, request.camera.height),

@@ -17,8 +17,8 @@ class Viewport:
     """Draws a ViewState onto a canvas.
 
     format: of the canvas's texture. frame: the one on show, None before the first. scale: its resolution, share of
-    the canvas's; 1 is the full one. moved_at: when the view last changed, seconds of `time.perf_counter`; `refresh`
-    does not count. stale: the scene has changed since it was drawn.
+    the canvas's; 1 is the full one. moved_at: when the view last changed, seconds of `time.perf_counter`. stale: to be
+    set where the scene itself has changed, until it was drawn.
     """
 
     def __init__(self, canvas: Any, state: ViewState) -> None:
@@ -40,11 +40,6 @@ class Viewport:
         """Whether the frame on show is final: of the full resolution."""
         return self.scale == 1 and self.frame is not None
 
-    def refresh(self) -> None:
-        """Draw again, because the scene itself has changed."""
-        self.stale = True
-        self.canvas.request_draw()
-
     def draw(self, now: float) -> None:
         """Draw the scene where something changed: at a lower resolution while it changes, in full once
         nothing has changed for SETTLED seconds. now: seconds of `time.perf_counter`."""
@@ -58,7 +53,7 @@ class Viewport:
         elif not self.stale and (self.at_rest or now - self.moved_at < SETTLED):
             return
         if state.training is not None:
-            state.renderer.forget()
+            state.renderer.moved = None
         self.scale = self._moving_scale if moving else 1.0
         camera = full
         if self.scale < 1:
@@ -83,9 +78,11 @@ class Viewport:
             return
         camera = self.frame.request.camera
         column, row = int(across * camera.width), int(down * camera.height)
-        depth = self.state.renderer.depth_at(self.frame, column, row)
+        depths = self.state.renderer.draw(self.frame.request._replace(mode="depth"))
         self._drawn = ()  # the frame's buffers hold the depth now
-        if depth is not None:
+        rest, depth = depths.planes.read()[3:, row, column].tolist()
+        alpha = 1.0 - rest
+        if alpha > 0.1:
             K, T = camera.K, camera.T_cam_world
             ray = [(column + 0.5 - K[0, 2]) / K[0, 0], (row + 0.5 - K[1, 2]) / K[1, 1], 1.0]
-            self.state.camera.focus_on(camera.position + depth * (T[:3, :3].T @ ray))
+            self.state.camera.focus_on(camera.position + depth / alpha * (T[:3, :3].T @ ray))

@@ -94,20 +94,12 @@ def page_html(scene: bytes, title: str, poster: NDArray[np.uint8], *, narrowest:
     edge = "#" + bytes(np.median(poster[0], axis=0).astype(np.uint8)).hex()
     style = web_file("player.css").replace("{{background}}", edge).replace("{{narrowest}}", f"{narrowest:.4g}")
     script = "\n".join(module_script(name) for name in MODULES)  # pages from file:// cannot import others
-    policy = "; ".join([
-        "default-src 'none'",
-        f"script-src '{_digest(script)}'",
-        f"style-src '{_digest(style)}'",
-        "img-src data: blob:",
-        "connect-src 'self'",
-        "base-uri 'none'",
-        "form-action 'none'",
-    ])  # fmt: skip
-    gestures = [
-        *((key.shown, key.help) for key in page_keys()),
-        *MOUSE,
-        ("two fingers", "move sideways, nearer or farther"),
-    ]
+    policy = (
+        f"default-src 'none'; script-src '{_digest(script)}'; style-src '{_digest(style)}'; "
+        "img-src data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'"
+    )
+    gestures = [(key.shown, key.help) for key in page_keys()]
+    gestures += [*MOUSE, ("two fingers", "move sideways, nearer or farther")]
     values = {
         "policy": policy,
         "title": html.escape(title),

@@ -16,8 +16,7 @@ def check_window(otherwise: str) -> None:
     """Raises InputError where no window can be opened here. otherwise: what works without one."""
     check_imgui()
     glfw = optional_module("glfw", "the window needs glfw", "viewer")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it warns, and a window without this check would abort the process
+    with warnings.catch_warnings(action="ignore"):  # it warns, and a window without this check would abort the process
         if glfw.init():
             return
     missing = sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
