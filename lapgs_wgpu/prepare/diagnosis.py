@@ -1,6 +1,5 @@
 """What a capture is worth: a number for each property that decides, what is wanted, and what to film differently."""
 
-import itertools
 import math
 from collections import Counter
 from collections.abc import Sequence
@@ -27,7 +26,6 @@ from lapgs_wgpu.splat.camera import Camera
 SIZE = 320  # longer side of the images that are looked at, pixels
 MOST_VIEWS = 96  # of a capture that are looked at, evenly chosen over the clip
 MOST_POINTS, MOST_CAMERAS = 1500, 48  # at which, and between which, angles are measured
-LEVELS = 16.0  # of 255 from the median over the clip: the pixel of a still camera moves
 LITTLE = 0.01  # share of the images that moves, at least
 SEEN = 0.002  # share of an image that moves, from which on it shows something that does
 POINTS_SEEN = 30  # in an image whose exposure is measured
@@ -104,19 +102,17 @@ def diagnose(folder: Path) -> Diagnosis:
 def _looks(folder: Path, views: Sequence[View], cameras: Sequence[Camera] | None) -> list[Look]:
     """The images of some views by time, with masks. cameras: those that stand still; then all show the same times."""
     groups = [views] if cameras is None else [[view for view in views if view.camera is camera] for camera in cameras]
-    chosen = [evenly(group, max(3, MOST_VIEWS // len(groups))) for group in groups]
+    chosen = [view for group in groups for view in evenly(group, max(3, MOST_VIEWS // len(groups)))]
     with ThreadPoolExecutor(4) as pool:
-        loaded = pool.map(lambda view: view.load()[..., :3], itertools.chain(*chosen))
-        images = iter(list(counted(loaded, sum(map(len, chosen)), "images looked at")))
-    looks: list[Look] = []
-    for group in chosen:
-        own = [Look(view, next(images), _mask(folder, view)) for view in group]
-        if cameras is not None:
-            levels = np.stack([_gray(look.image) for look in own])
-            moves = np.abs(levels - np.median(levels, axis=0)) > LEVELS
-            own = [look._replace(mask=mask) for look, mask in zip(own, moves, strict=True)]
-        looks += own
-    return looks
+        looked = pool.map(lambda view: Look(view, view.load()[..., :3], _mask(folder, view)), chosen)
+        looks = list(counted(looked, len(chosen), "images looked at"))
+    if cameras is None:
+        return looks
+    masks: list[Mask] = []
+    for camera in cameras:
+        levels = np.stack([_gray(look.image) for look in looks if look.view.camera is camera])
+        masks += list(np.abs(levels - np.median(levels, axis=0)) > 16.0)  # of 255: the pixel moves
+    return [look._replace(mask=mask) for look, mask in zip(looks, masks, strict=True)]
 
 
 def _mask(folder: Path, view: View) -> Mask | None:

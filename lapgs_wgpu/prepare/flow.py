@@ -19,7 +19,6 @@ from lapgs_wgpu.progress import Progress
 SIDE = 480  # longer side of the images that are followed, pixels
 STEP = 4  # pixels between the places that are followed
 REACH = 6  # images, to either side
-BETWEEN = 4  # steps from one image to the next, at most
 MEET, MEET_SHARE = 1.5, 0.05  # pixels between a place and its way forth and back, and more by this share of the way
 
 
@@ -88,13 +87,13 @@ class Motion:
 
 
 def film_frames(film: Film, pictures: Sequence[Picture]) -> Iterator[tuple[Pixels, bool]]:
-    """Small frames of a film from its first picture to its last, at most BETWEEN steps from one to the next."""
+    """Small frames of a film from its first picture to its last, at most 4 steps from one to the next."""
     times = [picture.seconds for picture in pictures]
     number, last = 0, 0.0
     for frame in film.frames():
         chosen = abs(frame.seconds - times[number]) < 1e-6
         span = times[number] - times[number - 1] if number else 0.0
-        if chosen or (number and frame.seconds - last >= span / BETWEEN - 1e-6):
+        if chosen or (number and frame.seconds - last >= span / 4 - 1e-6):
             yield np.ascontiguousarray(frame.pixels(SIDE)), chosen
             last = frame.seconds
         number += chosen

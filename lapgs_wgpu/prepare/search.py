@@ -18,9 +18,6 @@ FOCALS = 1.0, 1.4, 0.7  # times the width, where EXIF says nothing
 PURE, NEARLY = 0.8, 0.6  # share of the verified matches that turning alone explains: a pan; one, if nothing else fits
 GOOD, SHARP = 0.95, 1.5e-3  # the search ends: share of the images, and the mean error in parts of the longer side
 SECONDS, SECONDS_EACH, CORES = 20.0, 0.6, 2  # of the search: for any film, and for each image, on so many cores
-BENT = 0.4  # first radial coefficient of a lens, at most
-PANORAMA = 3000  # points of a pan
-GAP = 2  # images in a row without a camera, at most, in one part of a film
 
 
 class Found(NamedTuple):
@@ -94,21 +91,21 @@ def described(source: Reconstruction, model: Any) -> Found | None:
     points = np.stack([point.xyz for point in model.points3D.values()])
     faults = path_faults(places, axes, points, placed)
     camera = next(iter(model.cameras.values()))
-    if camera.model.name == "RADIAL" and abs(camera.params[3]) > BENT:
+    if camera.model.name == "RADIAL" and abs(camera.params[3]) > 0.4:
         faults.append(("a lens that no camera has", 0))
     error = float(model.compute_mean_reprojection_error())
     return Found(model, placed, tuple(faults), error, camera.mean_focal_length())
 
 
 def panned(source: Reconstruction, pan: Pan) -> Found:
-    """A pan as a reconstruction, with points of its features on a sphere of radius 1."""
+    """A pan as a reconstruction, with some 3000 points of its features on a sphere of radius 1."""
     rng, size = np.random.default_rng(0), source.size
     lens = Lens(*size, pan.focal, pan.focal, size[0] / 2, size[1] / 2, radial=(pan.radial, 0.0, 0.0))
     rotations = dict(zip(source.names, pan.rotations, strict=True))
     model = source.unpointed({name: (lens, np.pad(R, ((0, 0), (0, 1)))) for name, R in rotations.items()})
     for name, rotation in rotations.items():
         at = source.places[name][:, :2].astype(np.float64)
-        at = at[rng.permutation(len(at))[: max(1, PANORAMA // len(rotations))]]
+        at = at[rng.permutation(len(at))[: max(1, 3000 // len(rotations))]]
         ray = rays(at - np.array(size) / 2, pan.focal, pan.radial)
         points = ray / np.linalg.norm(ray, axis=1, keepdims=True) @ rotation
         column, row = np.clip(at.astype(int), 0, [size[0] - 1, size[1] - 1]).T
@@ -123,13 +120,11 @@ def again(source: Reconstruction, found: Found, masks: Mapping[str, Mask]) -> Fo
         rest = without(source.verified(), source.places, masks, source.size)
         pan = solve_pan(source.names, source.places, rest, source.size, found.pan.focal)
         return None if pan is None else panned(source, pan)
-    source.hide(masks)
-    seconds = SECONDS + SECONDS_EACH * len(source.names)
-    return _solved(source, found.focal, found.together, found.held, seconds)
+    source.verify(masks)
+    return _solved(source, found.focal, found.together, found.held, SECONDS + SECONDS_EACH * len(source.names))
 
 
 def longest_part(names: Sequence[str], placed: Sequence[str]) -> list[str]:
-    """The longest run of placed images, in which at most GAP images in a row are missing."""
-    number = {name: i for i, name in enumerate(names)}
-    gaps = np.diff([number[name] for name in placed])
-    return max(np.split(np.array(placed), np.flatnonzero(gaps > GAP + 1) + 1), key=len).tolist()
+    """The longest run of placed images, in which at most 2 images in a row are missing."""
+    steps = np.diff([names.index(name) for name in placed])
+    return max(np.split(np.array(placed), np.flatnonzero(steps > 3) + 1), key=len).tolist()
