@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -73,7 +72,6 @@ def prepare(
                 pictures = extract(films[0], folder / IMAGES, rate)
                 model = _moving_camera(films[0], folder, pictures, masks, poses)
             placed = write_model(folder, model, pictures)
-        shutil.rmtree(work, ignore_errors=True)
     cameras = len(films) if len(films) > 1 else len(pictures)
     say(f"{out}: {len(pictures)} images, {placed} of {cameras} cameras placed")
 
@@ -170,7 +168,7 @@ def _without_movers(source: Reconstruction, found: Found, motion: Motion) -> tup
     if seen.moving > LITTLE:
         say(f"{seen.moving:.1%} of the image area moves: masked, and the cameras are placed again.")
         other = again(source, found, seen.rough())
-        if other is not None and len(other.placed) >= len(found.placed) and len(other.faults) <= len(found.faults):
+        if other is not None and len(other.placed) >= len(found.placed) and other.faults <= found.faults:
             judged = judge(motion, other.model)
             if judged.explained(seen) > 0.98:  # else the masks took too much
                 found, seen = other, judged

@@ -118,8 +118,8 @@ def judge(motion: Motion, model: Any) -> Judged:
         if sum(map(len, found)):
             quarter = np.percentile(np.concatenate(found), 25)
             noise[apart] = max(noise[apart], 1.55 * quarter)  # the median, if all were noise
-    planes = np.stack([errors(i, noise)[0] for i in range(len(motion.names))])
-    planes = planes.reshape(-1, *motion.grid.shape[:2]).astype(np.float32)
+    planes = np.stack([errors(i, noise)[0] for i in range(len(motion.names))], dtype=np.float32)
+    planes = planes.reshape(-1, *motion.grid.shape[:2])
     votes = _votes(motion, planes)
     limit = max(float(np.log(MOVES)), np.log(HALO) + _valley(votes[votes > np.log(1.5)]))
     return Judged(motion.names, planes, votes, limit, float(noise[1]))

@@ -21,13 +21,13 @@ SECONDS, SECONDS_EACH, CORES = 20.0, 0.6, 2  # of the search: for any film, and 
 
 
 class Found(NamedTuple):
-    """model: a pycolmap.Reconstruction. placed: names of its images, in the order of time. faults: of its path, by the
-    images' numbers in `placed`. error: mean, pixels. focal: at the end, pixels. pan: None where the camera walks.
-    together: all cameras were placed at once. held: the focal length is not the film's, but where the search began."""
+    """model: a pycolmap.Reconstruction. placed: names of its images, in the order of time. faults: number, of its path
+    and its lens. error: mean, pixels. focal: at the end, pixels. pan: None where the camera walks. together: all
+    cameras were placed at once. held: the focal length is not the film's, but where the search began."""
 
     model: Any
     placed: tuple[str, ...]
-    faults: tuple[tuple[str, int], ...]
+    faults: int
     error: float
     focal: float
     pan: Pan | None = None
@@ -50,7 +50,7 @@ def search(source: Reconstruction, *, rival: bool = False) -> Found | None:
     tries += [(focal, False, False) for focal in focals] + [(focal, True, False) for focal in focals[2:]]
 
     def rank(found: Found) -> tuple[int, int, float]:
-        return round(20 * len(found.placed) / count), -len(found.faults), -found.error
+        return round(20 * len(found.placed) / count), -found.faults, -found.error
 
     best: Found | None = None
     wall, processor, spent, longest = time.monotonic(), time.process_time(), 0.0, 0.0
@@ -64,8 +64,8 @@ def search(source: Reconstruction, *, rival: bool = False) -> Found | None:
         before, spent = spent, (time.process_time() - processor) / CORES
         longest = max(longest, spent - before)
         if found is not None:
-            faults = f"{len(found.faults)} faults of the path"
-            say(f"{len(found.placed)} of {count} cameras placed, {found.error:.2f} pixels off, {faults}")
+            wrong = f"{found.error:.2f} pixels off, {found.faults} faults of the path"
+            say(f"{len(found.placed)} of {count} cameras placed, {wrong}")
             best = max(best or found, found, key=rank)
         if best is not None and len(best.placed) >= GOOD * count:
             good = not best.faults and best.error < max(1.0, SHARP * max(source.size))
@@ -89,12 +89,11 @@ def described(source: Reconstruction, model: Any) -> Found | None:
     places = np.stack([images[name].projection_center() for name in placed])
     axes = np.stack([images[name].viewing_direction() for name in placed])
     points = np.stack([point.xyz for point in model.points3D.values()])
-    faults = path_faults(places, axes, points, placed)
     camera = next(iter(model.cameras.values()))
-    if camera.model.name == "RADIAL" and abs(camera.params[3]) > 0.4:
-        faults.append(("a lens that no camera has", 0))
+    bent = camera.model.name == "RADIAL" and abs(camera.params[3]) > 0.4  # as no camera's lens is
+    faults = len(path_faults(places, axes, points, placed)) + bent
     error = float(model.compute_mean_reprojection_error())
-    return Found(model, placed, tuple(faults), error, camera.mean_focal_length())
+    return Found(model, placed, faults, error, camera.mean_focal_length())
 
 
 def panned(source: Reconstruction, pan: Pan) -> Found:
@@ -111,7 +110,7 @@ def panned(source: Reconstruction, pan: Pan) -> Found:
         column, row = np.clip(at.astype(int), 0, [size[0] - 1, size[1] - 1]).T
         for point, color in zip(points, decode(source.images / name)[row, column], strict=True):
             model.add_point3D(point, import_pycolmap().Track(), color)
-    return Found(model, tuple(rotations), (), 0.0, pan.focal, pan)
+    return Found(model, tuple(rotations), 0, 0.0, pan.focal, pan)
 
 
 def again(source: Reconstruction, found: Found, masks: Mapping[str, Mask]) -> Found | None:
