@@ -99,7 +99,7 @@ def _moving_camera(
     if moving is not None:
         source.verify(moving)
     found = described(source, source.given(known)) if known else search(source)
-    if found is None or len(found.placed) < (1 if known else max(2, round(FEWEST * len(names)))):
+    if found is None or len(found.placed) < (0 if known else round(FEWEST * len(names))):
         raise _refusal(source, found, folder, pictures)
     if known:
         say(f"{poses}: {len(found.placed)} of {len(names)} images have cameras, {found.error:.2f} pixels off (mean).")

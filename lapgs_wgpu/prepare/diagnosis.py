@@ -78,8 +78,7 @@ class Diagnosis(NamedTuple):
         views = (*self.dataset.train, *self.dataset.test)
         cameras = len({view.camera for view in views})
         layout = f"{cameras} cameras that stand still" if self.still else "a camera that moves"
-        understood = [f"capture: {self.dataset.summary}"] if self.dataset.summary else []
-        lines = [f"{len(views)} images, {layout}", *understood, *map(str, self.measures)]
+        lines = [f"{len(views)} images, {layout}", f"capture: {self.dataset.summary}", *map(str, self.measures)]
         return "\n".join([*lines, *(f" note  {warning}" for warning in self.dataset.warnings)])
 
 
@@ -87,7 +86,13 @@ def diagnose(folder: Path) -> Diagnosis:
     """Measure a capture of any format. Raises InputError where it cannot be opened."""
     dataset = load_dataset(folder, image_size=SIZE)
     views = sorted((*dataset.train, *dataset.test), key=lambda view: view.time)
-    cameras, points = list(dict.fromkeys(view.camera for view in views)), _points(dataset)
+    cameras = list(dict.fromkeys(view.camera for view in views))
+    if dataset.cloud is not None:
+        points = dataset.cloud.at_most(MOST_POINTS, 0).points.astype(np.float64)
+    elif dataset.depths is not None:  # random ones where views overlap
+        points = points_in_view(dataset.cameras, *dataset.depths, MOST_POINTS, 0).astype(np.float64)
+    else:
+        points = dataset.focus[None]
     still = len(views) >= 2 * len(cameras)
     looks = _looks(folder, views, cameras if still else None)
     measures = [parallax(cameras, points), moving_share(looks)]
@@ -122,15 +127,6 @@ def _mask(folder: Path, view: View) -> Mask | None:
         return None
     path = folder / MASKS / image.relative_to(folder / IMAGES).with_suffix(".png")
     return decode_mask(path) if path.is_file() else None
-
-
-def _points(dataset: Dataset) -> Floats:
-    """(N, 3) points of the scene: of its cloud, else random ones where views overlap, else what cameras look at."""
-    if dataset.cloud is not None:
-        return dataset.cloud.at_most(MOST_POINTS, 0).points.astype(np.float64)
-    if dataset.depths is not None:
-        return points_in_view(dataset.cameras, *dataset.depths, MOST_POINTS, 0).astype(np.float64)
-    return dataset.focus[None]
 
 
 def parallax(cameras: Sequence[Camera], points: Floats) -> Measure:

@@ -73,24 +73,15 @@ class Judged(NamedTuple):
         return dict(zip(self.names, wider, strict=True))
 
 
-def cut_out(motion: Motion, judged: Judged) -> dict[str, Mask]:
-    """Masks of what moves (h, w), of the size of the flow's images; none where flow tells of too little area."""
-    if judged.followed <= 0.2:
-        return {}
-    planes = zip(motion.names, motion.images, judged.votes, strict=True)
-    return {name: _cut(image, vote, judged.limit) for name, image, vote in planes}
-
-
 def judge(motion: Motion, model: Any) -> Judged:
     """model: a pycolmap.Reconstruction of some of the flow's images."""
-    placed = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
-    number = [i for i, name in enumerate(motion.names) if name in placed]
-    poses = {i: np.vstack([placed[motion.names[i]].cam_from_world().matrix(), [0, 0, 0, 1]]) for i in number}
+    images, number = [model.image(i) for i in model.reg_image_ids()], motion.names.index
+    poses = {number(image.name): np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for image in images}
     points = np.stack([point.xyz for point in model.points3D.values()])
     every = max(1, len(motion.names) // 20)
     depths = [points @ pose[2, :3] + pose[2, 3] for i, pose in poses.items() if i % every == 0]
     nearest = float(np.median([np.percentile(depth[depth > 0], 5) for depth in depths if (depth > 0).any()] or [1.0]))
-    camera = next(iter(placed.values())).camera
+    camera = images[0].camera
     scale = camera.width / motion.images[0].shape[1]
     focal = camera.mean_focal_length() / scale
 
@@ -173,6 +164,14 @@ def _valley(values: NDArray[np.floating]) -> float:
     low, span = float(values.min()), max(float(np.ptp(values)), 1e-9)
     levels = np.round(255 * (values - low) / span).astype(np.uint8)
     return low + span / 255 * float(import_cv2().threshold(levels, 0, 255, 8)[0])  # 8: THRESH_OTSU
+
+
+def cut_out(motion: Motion, judged: Judged) -> dict[str, Mask]:
+    """Masks of what moves (h, w), of the size of the flow's images; none where flow tells of too little area."""
+    if judged.followed <= 0.2:
+        return {}
+    planes = zip(motion.names, motion.images, judged.votes, strict=True)
+    return {name: _cut(image, vote, judged.limit) for name, image, vote in planes}
 
 
 def _cut(image: NDArray[np.uint8], vote: Plane, limit: float) -> Mask:

@@ -48,10 +48,6 @@ def search(source: Reconstruction, *, rival: bool = False) -> Found | None:
     focals = [source.prior] * source.exif + [focal * source.size[0] for focal in FOCALS]
     tries = [(focal, True, False) for focal in focals[:2]] + [(focals[0], way, True) for way in (True, False)]
     tries += [(focal, False, False) for focal in focals] + [(focal, True, False) for focal in focals[2:]]
-
-    def rank(found: Found) -> tuple[int, int, float]:
-        return round(20 * len(found.placed) / count), -found.faults, -found.error
-
     best: Found | None = None
     wall, processor, spent, longest = time.monotonic(), time.process_time(), 0.0, 0.0
     for number, (focal, together, held) in enumerate(tries):
@@ -66,7 +62,9 @@ def search(source: Reconstruction, *, rival: bool = False) -> Found | None:
         if found is not None:
             wrong = f"{found.error:.2f} pixels off, {found.faults} faults of the path"
             say(f"{len(found.placed)} of {count} cameras placed, {wrong}")
-            best = max(best or found, found, key=rank)
+            best = max(
+                best or found, found, key=lambda one: (round(20 * len(one.placed) / count), -one.faults, -one.error)
+            )
         if best is not None and len(best.placed) >= GOOD * count:
             good = not best.faults and best.error < max(1.0, SHARP * max(source.size))
             if rival or (number and good):
