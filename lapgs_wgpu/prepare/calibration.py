@@ -175,8 +175,7 @@ def _camera(
 def match_names(cameras: Iterable[str], names: Sequence[str]) -> dict[str, str]:
     """Return the camera for each of `names` that has one: its name or a part of its path is the same, whatever the
     suffixes, or ends the name after an underscore (hd_00_01 is 00_01)."""
-    parts = {name: {PurePosixPath(part).stem.lower() for part in re.split(r"[/\\]", name)} for name in cameras}
-    owner = {part: name for name in reversed(parts) for part in parts[name]}
+    owner = {PurePosixPath(part).stem.lower(): name for name in [*cameras][::-1] for part in re.split(r"[/\\]", name)}
     found = {}
     for name in names:
         words = PurePosixPath(name).stem.lower().split("_")
