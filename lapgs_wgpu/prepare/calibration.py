@@ -8,7 +8,7 @@ R, T) name its matrices, and the .json of CMU Panoptic. All of these count pixel
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
@@ -56,6 +56,9 @@ class Calibrated(NamedTuple):
         return self.lens.resized(*size)
 
 
+Named = tuple[str, Calibrated]
+
+
 def read_calibration(path: Path) -> dict[str, Calibrated]:
     """Return the cameras of a file, or of the folder of a model, by their names or their images'. Raises InputError."""
     model = next((f for f in (path, path.parent, path / "sparse/0", path / "sparse", path / "0") if is_model(f)), None)
@@ -69,17 +72,13 @@ def read_calibration(path: Path) -> dict[str, Calibrated]:
     try:
         if path.suffix == ".json" and head:
             data = read_json(path)
-            if "cameras" in data:  # CMU Panoptic's
-                entries = {str(entry.required("name")): entry for entry in data.objects("cameras", "camera")}
-                cameras = _tabled(entries, "K", "distCoef", "R", "t", "resolution")
-            else:
-                cameras = _nerfstudio(data)
+            cameras = dict(_panoptic(data) if "cameras" in data else _nerfstudio(data))
         elif head.startswith(b"<"):
-            cameras = _qualisys(path)
+            cameras = dict(_qualisys(path))
         elif path.suffix == ".toml" and head:
-            cameras = _toml(path)
+            cameras = dict(_toml(path))
         elif b"YAML" in head:
-            cameras = _opencv(path)
+            cameras = dict(_opencv(path))
     except InputError:
         raise
     except (SyntaxError, TypeError, ValueError) as error:  # of XML, numbers, arrays
@@ -90,36 +89,35 @@ def read_calibration(path: Path) -> dict[str, Calibrated]:
     return cameras
 
 
-def _nerfstudio(data: Fields) -> dict[str, Calibrated]:
-    cameras = {}
+def _nerfstudio(data: Fields) -> Iterator[Named]:
     for entry in data.objects("frames", "frame"):
         name = str(entry.required("file_path"))
         width, height = ((entry if side in entry else data).side(side) for side in "wh")
         lens, _ = read_lens(entry, data, ImageFile(Path(name), (width, height)))
-        cameras[name] = Calibrated(lens, opengl_pose(entry.required("transform_matrix"), entry.where), entry.where)
-    return cameras
+        yield name, Calibrated(lens, opengl_pose(entry.required("transform_matrix"), entry.where), entry.where)
 
 
-def _toml(path: Path) -> dict[str, Calibrated]:
-    entries = {}
+def _panoptic(data: Fields) -> Iterator[Named]:
+    for entry in data.objects("cameras", "camera"):
+        yield _tabled(entry, str(entry.required("name")), "K", "distCoef", "R", "t", "resolution")
+
+
+def _toml(path: Path) -> Iterator[Named]:
     for key, value in safe_json_toml.read_toml(path).items():
         if isinstance(value, dict) and "matrix" in value:  # others are metadata
-            entries[str(value.get("name", key))] = as_fields(value, f"{path}, {key}")
             if value.get("fisheye"):
                 raise InputError(f"{path}, {key} has a fisheye lens, which is not read; undistort its film first.")
-    return _tabled(entries, "matrix", "distortions", "rotation", "translation", "size")
+            entry, name = as_fields(value, f"{path}, {key}"), str(value.get("name", key))
+            yield _tabled(entry, name, "matrix", "distortions", "rotation", "translation", "size")
 
 
-def _tabled(entries: Mapping[str, Fields], *names: str) -> dict[str, Calibrated]:
+def _tabled(entry: Fields, name: str, *fields: str) -> Named:
     """Of fields for K, distortion, rotation, translation and size."""
-    cameras = {}
-    for key, entry in entries.items():
-        K, distortion, rotation, translation, size = (np.array(entry.entries(name), np.float64) for name in names)
-        cameras[key] = _camera(K, distortion, rotation, translation, size, f"{entry.where} ({key})")
-    return cameras
+    K, distortion, rotation, translation, size = (np.array(entry.entries(field), np.float64) for field in fields)
+    return name, _camera(K, distortion, rotation, translation, size, f"{entry.where} ({name})")
 
 
-def _opencv(path: Path) -> dict[str, Calibrated]:
+def _opencv(path: Path) -> Iterator[Named]:
     """Of all matrices in the file, and in those that usually lie beside it."""
     beside = [path.with_name(name) for name in ("intri.yml", "extri.yml", "intrinsics.yml", "extrinsics.yml")]
     files = [path, *(file for file in beside if file.is_file() and path in beside)]
@@ -127,19 +125,16 @@ def _opencv(path: Path) -> dict[str, Calibrated]:
     found = {_STEREO.get(name, name): np.array(data.split(","), np.float64) for name, data in _MATRIX.findall(text)}
     if {"K_1", "Rot_2"} <= found.keys():  # the second camera's pose is that beside the first one
         found = {"Rot_1": np.eye(3).ravel(), "T_1": np.zeros(3)} | found
-    cameras = {}
     for name in [key[2:] for key in found if key.startswith("K_")]:
         rotation, translation = found.get(f"Rot_{name}", found.get(f"R_{name}")), found.get(f"T_{name}")
         if rotation is None or translation is None:
             raise InputError(f"{path} has K_{name}, but no R_{name} and T_{name}, nor have files beside it; add them.")
         distortion = found.get(f"dist_{name}", np.zeros(0))
         K, R = found[f"K_{name}"].reshape(-1, 3), rotation.reshape((3, 3) if rotation.size == 9 else -1)
-        cameras[name] = _camera(K, distortion, R, translation, None, f"{path}, camera {name}")
-    return cameras
+        yield name, _camera(K, distortion, R, translation, None, f"{path}, camera {name}")
 
 
-def _qualisys(path: Path) -> dict[str, Calibrated]:
-    cameras = {}
+def _qualisys(path: Path) -> Iterator[Named]:
     for i, camera in enumerate(ElementTree.parse(path).iter("camera")):
         name = camera.get("serial", str(i))
         parts = [part for tag in ("transform", "intrinsic", "fov_video") for part in camera.findall(tag)]
@@ -150,8 +145,7 @@ def _qualisys(path: Path) -> dict[str, Calibrated]:
         R = OPENGL_TO_OPENCV @ [[values.number(f"r{n}{m}") for m in (1, 2, 3)] for n in (1, 2, 3)]
         t = -R @ [values.number(axis) for axis in "xyz"] / 1000
         K = np.array([[fx / 64, 0, cx / 64 - left], [0, fy / 64, cy / 64 - top], [0, 0, 1]])
-        cameras[name] = _camera(K, distortion, R, t, (right - left + 1, bottom - top + 1), values.where)
-    return cameras
+        yield name, _camera(K, distortion, R, t, (right - left + 1, bottom - top + 1), values.where)
 
 
 def _camera(
@@ -181,8 +175,7 @@ def _camera(
 def match_names(cameras: Iterable[str], names: Sequence[str]) -> dict[str, str]:
     """Return the camera for each of `names` that has one: its name or a part of its path is the same, whatever the
     suffixes, or ends the name after an underscore (hd_00_01 is 00_01)."""
-    parts = {name: {PurePosixPath(part).stem.lower() for part in re.split(r"[/\\]", name)} for name in cameras}
-    owner = {part: name for name in reversed(parts) for part in parts[name]}
+    owner = {PurePosixPath(part).stem.lower(): name for name in [*cameras][::-1] for part in re.split(r"[/\\]", name)}
     found = {}
     for name in names:
         words = PurePosixPath(name).stem.lower().split("_")

@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -28,11 +27,8 @@ from lapgs_wgpu.progress import say
 
 # Square pixels: a lens with more freedom bends until things that move seem to stand still.
 LENS = "RADIAL"
-FEWEST, WHOLE = 0.3, 0.9  # of the images need a pose; of fewer than this only a part of the film fits
+FEWEST = 0.3  # of the images need a pose
 LITTLE, MUCH = 0.002, 0.15  # share of the images: less motion needs no masks; more may have led the cameras astray
-AGAIN = 0.98  # of the area that was explained before, at least, by cameras without what moves
-FOLLOWED = 0.8  # least share of the image area in which the flow tells whether it moves; below it, a warning
-STANDING = 4e-3  # of the longer side: the image of a camera that stands still moves less over the film
 FEATURES, SHARED = 200, 60  # of an image; in common with the next one: wanted at least
 
 
@@ -74,9 +70,8 @@ def prepare(
                 pictures, model = place_still(films, folder / IMAGES, rate, work)
             else:
                 pictures = extract(films[0], folder / IMAGES, rate)
-                model = _moving_camera(films[0], folder, pictures, masks, poses, work)
+                model = _moving_camera(films[0], folder, pictures, masks, poses)
             placed = write_model(folder, model, pictures)
-        shutil.rmtree(work, ignore_errors=True)
     cameras = len(films) if len(films) > 1 else len(pictures)
     say(f"{out}: {len(pictures)} images, {placed} of {cameras} cameras placed")
 
@@ -91,7 +86,7 @@ def write_model(folder: Path, model: Any, pictures: Sequence[Picture]) -> int:
 
 
 def _moving_camera(
-    film: Film, folder: Path, pictures: Sequence[Picture], masks: Path | None, poses: Path | None, work: Path
+    film: Film, folder: Path, pictures: Sequence[Picture], masks: Path | None, poses: Path | None
 ) -> Any:
     """The pycolmap.Reconstruction; writes masks of what moves. masks, poses: the user's; None to find them."""
     names = [picture.name for picture in pictures]
@@ -99,12 +94,12 @@ def _moving_camera(
     moving = None if masks is None else read_masks(masks, names, size)
     known = {} if poses is None else _known(names, poses, size)
     lenses = "SINGLE" if len({lens for lens, _ in known.values()}) < 2 else "PER_IMAGE"
-    source = Reconstruction(folder / IMAGES, names, work, "OPENCV" if known else LENS, lenses)
+    source = Reconstruction(folder / IMAGES, names, folder / WORK, "OPENCV" if known else LENS, lenses)
     source.match(neighbouring_pairs(names))
     if moving is not None:
-        source.hide(moving)
+        source.verify(moving)
     found = described(source, source.given(known)) if known else search(source)
-    if found is None or len(found.placed) < (1 if known else max(2, round(FEWEST * len(names)))):
+    if found is None or len(found.placed) < (0 if known else round(FEWEST * len(names))):
         raise _refusal(source, found, folder, pictures)
     if known:
         say(f"{poses}: {len(found.placed)} of {len(names)} images have cameras, {found.error:.2f} pixels off (mean).")
@@ -117,7 +112,7 @@ def _moving_camera(
         moving = cut_out(motion, seen)
     write_masks(folder / MASKS, moving)
     if found.pan is not None:
-        turns = "stands still" if found.pan.travel < STANDING * max(size) else "turns on the spot"
+        turns = "stands still" if found.pan.travel < 4e-3 * max(size) else "turns on the spot"
         say(
             f"the camera {turns}: turning alone explains {found.pan.explained:.0%} of what several images show, over "
             f"{found.pan.travel:.0f} pixels. It is placed as a pan, a panorama at one depth with what moves in front; "
@@ -125,7 +120,7 @@ def _moving_camera(
         )
     if found.held:
         say(f"the film does not tell the focal length: {found.focal / size[0]:.1f} of the width are taken.")
-    if len(found.placed) < WHOLE * len(names):
+    if len(found.placed) < 0.9 * len(names):
         part = longest_part(names, found.placed)
         say(
             f"only a part of the film fits together: {len(found.placed)} of {len(names)} images, {len(part)} of them "
@@ -137,13 +132,13 @@ def _moving_camera(
 def _known(names: Sequence[str], poses: Path, size: Size) -> dict[str, tuple[Lens, Floats]]:
     """Lens and pose of the images that have a camera of their name. Raises InputError."""
     cameras = read_calibration(poses)
-    found = {name: cameras[camera] for name, camera in match_names(cameras, names).items()}
+    found = match_names(cameras, names)
     if len(found) < 2:
         raise InputError(
             f"{poses} has {len(cameras)} cameras, such as {next(iter(cameras))[:80]}, and {len(found)} of {len(names)} "
             f"images, such as {names[0]}, have one of their name; give the images for which it was made."
         )
-    return {name: (camera.lens_for(size), camera.T_cam_world) for name, camera in found.items()}
+    return {name: (cameras[camera].lens_for(size), cameras[camera].T_cam_world) for name, camera in found.items()}
 
 
 def _without_movers(source: Reconstruction, found: Found, motion: Motion) -> tuple[Found, Judged]:
@@ -159,13 +154,13 @@ def _without_movers(source: Reconstruction, found: Found, motion: Motion) -> tup
             break
         of = "the images' rims" if rims else "what disagrees"
         say(f"{seen.moving:.0%} of the image area disagrees with these cameras: trying {of} alone.")
-        source.hide(dict.fromkeys(source.names, RIM) if rims else seen.rough(turned_over=True))
+        source.verify(dict.fromkeys(source.names, RIM) if rims else seen.rough(turned_over=True))
         other = search(source, rival=True)
         if other is not None and len(other.placed) >= FEWEST * len(source.names):
             judged = judge(motion, other.model)
             if judged.explained(seen) > 1:
                 found, seen = other, judged
-    if seen.followed < FOLLOWED:
+    if seen.followed < 0.8:
         say(
             f"what moves could not be looked for in {1 - seen.followed:.0%} of the image area, where nothing could be "
             "followed from image to image: no mask covers that; film slower or with more light."
@@ -173,9 +168,9 @@ def _without_movers(source: Reconstruction, found: Found, motion: Motion) -> tup
     if seen.moving > LITTLE:
         say(f"{seen.moving:.1%} of the image area moves: masked, and the cameras are placed again.")
         other = again(source, found, seen.rough())
-        if other is not None and len(other.placed) >= len(found.placed) and len(other.faults) <= len(found.faults):
+        if other is not None and len(other.placed) >= len(found.placed) and other.faults <= found.faults:
             judged = judge(motion, other.model)
-            if judged.explained(seen) > AGAIN:  # else the masks took too much
+            if judged.explained(seen) > 0.98:  # else the masks took too much
                 found, seen = other, judged
     if found.pan is None and (wrong := seen.contradicted()):
         say(

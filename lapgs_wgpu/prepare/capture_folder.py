@@ -42,12 +42,12 @@ def appearing(out: Path) -> Iterator[Path]:
             yield partial
         except RefusedError as error:
             refused = str(error)
-            shutil.rmtree(partial / WORK, ignore_errors=True)
             (partial / REFUSED).write_text(refused, encoding="utf-8")
         except BaseException:
             shutil.rmtree(partial, ignore_errors=True)
             raise
         try:
+            shutil.rmtree(partial / WORK, ignore_errors=True)
             if (out / REFUSED).is_file():
                 for name in (IMAGES, SPARSE, TIMES, MASKS, REPORT, REFUSED):
                     shutil.rmtree(out / name) if (out / name).is_dir() else (out / name).unlink(missing_ok=True)

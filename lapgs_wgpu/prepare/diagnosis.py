@@ -1,6 +1,5 @@
 """What a capture is worth: a number for each property that decides, what is wanted, and what to film differently."""
 
-import itertools
 import math
 from collections import Counter
 from collections.abc import Sequence
@@ -27,7 +26,6 @@ from lapgs_wgpu.splat.camera import Camera
 SIZE = 320  # longer side of the images that are looked at, pixels
 MOST_VIEWS = 96  # of a capture that are looked at, evenly chosen over the clip
 MOST_POINTS, MOST_CAMERAS = 1500, 48  # at which, and between which, angles are measured
-LEVELS = 16.0  # of 255 from the median over the clip: the pixel of a still camera moves
 LITTLE = 0.01  # share of the images that moves, at least
 SEEN = 0.002  # share of an image that moves, from which on it shows something that does
 POINTS_SEEN = 30  # in an image whose exposure is measured
@@ -80,8 +78,7 @@ class Diagnosis(NamedTuple):
         views = (*self.dataset.train, *self.dataset.test)
         cameras = len({view.camera for view in views})
         layout = f"{cameras} cameras that stand still" if self.still else "a camera that moves"
-        understood = [f"capture: {self.dataset.summary}"] if self.dataset.summary else []
-        lines = [f"{len(views)} images, {layout}", *understood, *map(str, self.measures)]
+        lines = [f"{len(views)} images, {layout}", f"capture: {self.dataset.summary}", *map(str, self.measures)]
         return "\n".join([*lines, *(f" note  {warning}" for warning in self.dataset.warnings)])
 
 
@@ -89,7 +86,13 @@ def diagnose(folder: Path) -> Diagnosis:
     """Measure a capture of any format. Raises InputError where it cannot be opened."""
     dataset = load_dataset(folder, image_size=SIZE)
     views = sorted((*dataset.train, *dataset.test), key=lambda view: view.time)
-    cameras, points = list(dict.fromkeys(view.camera for view in views)), _points(dataset)
+    cameras = list(dict.fromkeys(view.camera for view in views))
+    if dataset.cloud is not None:
+        points = dataset.cloud.at_most(MOST_POINTS, 0).points.astype(np.float64)
+    elif dataset.depths is not None:  # random ones where views overlap
+        points = points_in_view(dataset.cameras, *dataset.depths, MOST_POINTS, 0).astype(np.float64)
+    else:
+        points = dataset.focus[None]
     still = len(views) >= 2 * len(cameras)
     looks = _looks(folder, views, cameras if still else None)
     measures = [parallax(cameras, points), moving_share(looks)]
@@ -104,19 +107,17 @@ def diagnose(folder: Path) -> Diagnosis:
 def _looks(folder: Path, views: Sequence[View], cameras: Sequence[Camera] | None) -> list[Look]:
     """The images of some views by time, with masks. cameras: those that stand still; then all show the same times."""
     groups = [views] if cameras is None else [[view for view in views if view.camera is camera] for camera in cameras]
-    chosen = [evenly(group, max(3, MOST_VIEWS // len(groups))) for group in groups]
+    chosen = [view for group in groups for view in evenly(group, max(3, MOST_VIEWS // len(groups)))]
     with ThreadPoolExecutor(4) as pool:
-        loaded = pool.map(lambda view: view.load()[..., :3], itertools.chain(*chosen))
-        images = iter(list(counted(loaded, sum(map(len, chosen)), "images looked at")))
-    looks: list[Look] = []
-    for group in chosen:
-        own = [Look(view, next(images), _mask(folder, view)) for view in group]
-        if cameras is not None:
-            levels = np.stack([_gray(look.image) for look in own])
-            moves = np.abs(levels - np.median(levels, axis=0)) > LEVELS
-            own = [look._replace(mask=mask) for look, mask in zip(own, moves, strict=True)]
-        looks += own
-    return looks
+        looked = pool.map(lambda view: Look(view, view.load()[..., :3], _mask(folder, view)), chosen)
+        looks = list(counted(looked, len(chosen), "images looked at"))
+    if cameras is None:
+        return looks
+    masks: list[Mask] = []
+    for camera in cameras:
+        levels = np.stack([_gray(look.image) for look in looks if look.view.camera is camera])
+        masks += list(np.abs(levels - np.median(levels, axis=0)) > 16.0)  # of 255: the pixel moves
+    return [look._replace(mask=mask) for look, mask in zip(looks, masks, strict=True)]
 
 
 def _mask(folder: Path, view: View) -> Mask | None:
@@ -126,15 +127,6 @@ def _mask(folder: Path, view: View) -> Mask | None:
         return None
     path = folder / MASKS / image.relative_to(folder / IMAGES).with_suffix(".png")
     return decode_mask(path) if path.is_file() else None
-
-
-def _points(dataset: Dataset) -> Floats:
-    """(N, 3) points of the scene: of its cloud, else random ones where views overlap, else what cameras look at."""
-    if dataset.cloud is not None:
-        return dataset.cloud.at_most(MOST_POINTS, 0).points.astype(np.float64)
-    if dataset.depths is not None:
-        return points_in_view(dataset.cameras, *dataset.depths, MOST_POINTS, 0).astype(np.float64)
-    return dataset.focus[None]
 
 
 def parallax(cameras: Sequence[Camera], points: Floats) -> Measure:

@@ -19,7 +19,6 @@ from lapgs_wgpu.progress import Progress
 SIDE = 480  # longer side of the images that are followed, pixels
 STEP = 4  # pixels between the places that are followed
 REACH = 6  # images, to either side
-BETWEEN = 4  # steps from one image to the next, at most
 MEET, MEET_SHARE = 1.5, 0.05  # pixels between a place and its way forth and back, and more by this share of the way
 
 
@@ -45,7 +44,8 @@ class Motion:
                 if before is not None:
                     there, again = dis.calc(before, gray, None), dis.calc(gray, before, None)
                     if flow:
-                        there, again = flow[0] + self._moved(there, flow[0]), again + self._moved(flow[1], again)
+                        pixels = np.stack(np.meshgrid(*map(np.arange, gray.shape[::-1])), axis=-1).astype(np.float32)
+                        there, again = flow[0] + _at(there, pixels + flow[0]), again + _at(flow[1], pixels + again)
                     flow = [there, again]
                 before = gray
                 if chosen:
@@ -65,36 +65,32 @@ class Motion:
         for way, flows in ((1, self.flows[image:]), (-1, before)):
             at = self.grid
             for offset, (there, again) in enumerate(flows[:REACH], start=1):
-                step = self._at(there.astype(np.float32), at)
+                step = _at(there.astype(np.float32), at)
                 on = at + step
-                apart = np.linalg.norm(step + self._at(again.astype(np.float32), on), axis=-1)
+                apart = np.linalg.norm(step + _at(again.astype(np.float32), on), axis=-1)
                 on[~(apart < MEET + MEET_SHARE * np.linalg.norm(step, axis=-1))] = np.nan
                 found[way * offset] = at = on
         return found
 
     def on_grid(self, values: Plane, at: Plane) -> Plane:
         """Values (rows, columns) of a grid at places (rows, columns, 2) in pixels; NaN outside."""
-        return self._at(values, ((at - STEP // 2) / STEP).astype(np.float32))
+        return _at(values, ((at - STEP // 2) / STEP).astype(np.float32))
 
-    def _at(self, values: Plane, at: Plane) -> Plane:
-        cv2 = import_cv2()
-        x, y = (np.ascontiguousarray(np.nan_to_num(at[..., i], nan=-9.0), dtype=np.float32) for i in (0, 1))
-        return cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(np.nan,) * 4)
 
-    def _moved(self, values: Plane, flow: Plane) -> Plane:
-        height, width = flow.shape[:2]
-        pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
-        return self._at(values, pixels + flow)
+def _at(values: Plane, at: Plane) -> Plane:
+    cv2 = import_cv2()
+    x, y = (np.ascontiguousarray(np.nan_to_num(at[..., i], nan=-9.0), dtype=np.float32) for i in (0, 1))
+    return cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(np.nan,) * 4)
 
 
 def film_frames(film: Film, pictures: Sequence[Picture]) -> Iterator[tuple[Pixels, bool]]:
-    """Small frames of a film from its first picture to its last, at most BETWEEN steps from one to the next."""
+    """Small frames of a film from its first picture to its last, at most 4 steps from one to the next."""
     times = [picture.seconds for picture in pictures]
     number, last = 0, 0.0
     for frame in film.frames():
         chosen = abs(frame.seconds - times[number]) < 1e-6
         span = times[number] - times[number - 1] if number else 0.0
-        if chosen or (number and frame.seconds - last >= span / BETWEEN - 1e-6):
+        if chosen or (number and frame.seconds - last >= span / 4 - 1e-6):
             yield np.ascontiguousarray(frame.pixels(SIDE)), chosen
             last = frame.seconds
         number += chosen

@@ -23,7 +23,6 @@ LEAST_IMAGES = 60  # of one moving camera, where the film has so many frames
 MOST_IMAGES = 300  # of a film, unless --fps asks for more
 LONGER_SIDE = 1920  # pixels: larger frames are shrunk
 BLACK = 6.0  # levels of 255: the mean of a black image
-JPEG_QUALITY = 95
 
 
 class Picture(NamedTuple):
@@ -135,5 +134,5 @@ def _write(frame: Frame, images: Path, prefix: str, shape: Shape) -> Picture:
     """Write a JPEG image. prefix: of its name, such as "cam00/"."""
     name = f"{prefix}{frame.name or f'{round(1000 * frame.seconds):08d}'}.jpg"
     (images / name).parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(shape.apply(frame)).save(images / name, quality=JPEG_QUALITY, subsampling=0, exif=frame.exif)
+    Image.fromarray(shape.apply(frame)).save(images / name, quality=95, subsampling=0, exif=frame.exif)
     return Picture(name, frame.seconds)

@@ -19,19 +19,12 @@ from lapgs_wgpu.prepare.flow import REACH, Motion
 from lapgs_wgpu.prepare.poses import Floats, Plane, import_cv2
 
 NOISE, NOISE_GROWS = 0.15, 0.05  # pixels of flow, at least: between neighbouring images; for each further one
-QUARTER, MEDIAN = 25, 1.55  # percentile of the errors that tells the noise; a median of noise beside it
 MOST = 30.0  # times the noise: larger errors are equal
-PASSES = 4  # of the robust fit of a depth
-NEAR = 0.5  # times the depth of the nearest points of the scene: nothing is nearer
-UNKNOWN = 0.2  # share of the image area in which flow must tell whether it moves; less makes no masks
 FEWEST = 2  # images around one, in which a place must be followed
-VOTES = 4  # images to either side that vote
 MOVES = 5.0  # times the noise, at least: it moves
 HALO = 1.5  # times the error that parts what moves from the rest: flow bends around what moves
 SHARP = 2.5  # times the noise of the better of two reconstructions: it agrees
-LITTLE = 0.002  # share of an image: a smaller mask is noise
 RIM = np.pad(np.ones((42, 42), bool), 9)  # mask of all but an image's rim, which seldom shows what moves
-AROUND, INSIDE = 10, 5  # pixels around what moves, where colors decide; within it, where they do not
 
 
 class Judged(NamedTuple):
@@ -82,31 +75,13 @@ class Judged(NamedTuple):
 
 def judge(motion: Motion, model: Any) -> Judged:
     """model: a pycolmap.Reconstruction of some of the flow's images."""
-    errors, noise = unexplained(motion, model)
-    votes = _votes(motion, errors)
-    limit = max(float(np.log(MOVES)), np.log(HALO) + _valley(votes[votes > np.log(1.5)]))
-    return Judged(motion.names, errors, votes, limit, noise)
-
-
-def cut_out(motion: Motion, judged: Judged) -> dict[str, Mask]:
-    """Masks of what moves (h, w), of the size of the flow's images; none where flow tells too little."""
-    if judged.followed <= UNKNOWN:
-        return {}
-    planes = zip(motion.names, motion.images, judged.votes, strict=True)
-    return {name: _cut(image, vote, judged.limit) for name, image, vote in planes}
-
-
-def unexplained(motion: Motion, model: Any) -> tuple[Plane, float]:
-    """The error (n, rows, columns) of the images' grids, in times the noise, NaN where nothing can be said; and the
-    noise between neighbouring images, pixels."""
-    placed = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
-    number = [i for i, name in enumerate(motion.names) if name in placed]
-    poses = {i: np.vstack([placed[motion.names[i]].cam_from_world().matrix(), [0, 0, 0, 1]]) for i in number}
+    images, number = [model.image(i) for i in model.reg_image_ids()], motion.names.index
+    poses = {number(image.name): np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for image in images}
     points = np.stack([point.xyz for point in model.points3D.values()])
     every = max(1, len(motion.names) // 20)
     depths = [points @ pose[2, :3] + pose[2, 3] for i, pose in poses.items() if i % every == 0]
     nearest = float(np.median([np.percentile(depth[depth > 0], 5) for depth in depths if (depth > 0).any()] or [1.0]))
-    camera = next(iter(placed.values())).camera
+    camera = images[0].camera
     scale = camera.width / motion.images[0].shape[1]
     focal = camera.mean_focal_length() / scale
 
@@ -123,7 +98,8 @@ def unexplained(motion: Motion, model: Any) -> tuple[Plane, float]:
         relative = np.stack([poses[i + k] for k in tracks]) @ np.linalg.inv(poses[i])
         seen = np.stack([directions(at) for at in tracks.values()])
         sigma = np.array([noise[abs(k)] for k in tracks]) / focal
-        total, each = depth_errors(directions(motion.grid), seen, relative, sigma, 1 / (NEAR * nearest))
+        # Nothing is nearer than half as far as the nearest points of the scene.
+        total, each = depth_errors(directions(motion.grid), seen, relative, sigma, 2 / nearest)
         return total, dict(zip(tracks, each * sigma[:, None] * focal, strict=True))
 
     noise = NOISE + NOISE_GROWS * np.arange(REACH + 1)
@@ -131,9 +107,13 @@ def unexplained(motion: Motion, model: Any) -> tuple[Plane, float]:
     for apart in range(1, REACH + 1):
         found = [error[np.isfinite(error)] for each in samples for k, error in each.items() if abs(k) == apart]
         if sum(map(len, found)):
-            noise[apart] = max(noise[apart], MEDIAN * np.percentile(np.concatenate(found), QUARTER))
-    planes = np.stack([errors(i, noise)[0] for i in range(len(motion.names))])
-    return planes.reshape(-1, *motion.grid.shape[:2]).astype(np.float32), float(noise[1])
+            quarter = np.percentile(np.concatenate(found), 25)
+            noise[apart] = max(noise[apart], 1.55 * quarter)  # the median, if all were noise
+    planes = np.stack([errors(i, noise)[0] for i in range(len(motion.names))], dtype=np.float32)
+    planes = planes.reshape(-1, *motion.grid.shape[:2])
+    votes = _votes(motion, planes)
+    limit = max(float(np.log(MOVES)), np.log(HALO) + _valley(votes[votes > np.log(1.5)]))
+    return Judged(motion.names, planes, votes, limit, float(noise[1]))
 
 
 def depth_errors(ray: Floats, seen: Floats, relative: Floats, sigma: Floats, most: float) -> tuple[Floats, Floats]:
@@ -152,7 +132,7 @@ def depth_errors(ray: Floats, seen: Floats, relative: Floats, sigma: Floats, mos
     b = far[..., :2] - seen * far[..., 2:]
     weight = known / sigma[:, None] ** 2
     inverse, total, error = np.zeros(len(ray), np.float32), np.full(len(ray), np.inf), np.zeros(known.shape)
-    for step in range(PASSES + 1):
+    for step in range(5):
         if step:
             z = np.maximum(far[..., 2] + inverse * move[..., 2], 1e-3)
             w = (weight / z**2 / (1.0 if step == 1 else 1 + np.square(error / 2)))[..., None]
@@ -165,10 +145,11 @@ def depth_errors(ray: Floats, seen: Floats, relative: Floats, sigma: Floats, mos
 
 
 def _votes(motion: Motion, errors: Plane) -> Plane:
-    """The mean logarithm of the errors along each place's way, near images first."""
+    """The mean logarithm of the errors along each place's way through up to 4 images to either side, the nearer ones
+    with more weight."""
     logs, result = np.log(np.maximum(errors, 0.5)), []
     for i, own in enumerate(logs):
-        ways = {0: own} | {k: motion.on_grid(logs[i + k], at) for k, at in motion.tracks[i].items() if abs(k) <= VOTES}
+        ways = {0: own} | {k: motion.on_grid(logs[i + k], at) for k, at in motion.tracks[i].items() if abs(k) <= 4}
         votes = np.stack(list(ways.values()))
         weight = np.isfinite(votes) / (1.0 + np.abs(list(ways)))[:, None, None]
         with np.errstate(invalid="ignore"):  # NaN where no image tells
@@ -185,6 +166,14 @@ def _valley(values: NDArray[np.floating]) -> float:
     return low + span / 255 * float(import_cv2().threshold(levels, 0, 255, 8)[0])  # 8: THRESH_OTSU
 
 
+def cut_out(motion: Motion, judged: Judged) -> dict[str, Mask]:
+    """Masks of what moves (h, w), of the size of the flow's images; none where flow tells of too little area."""
+    if judged.followed <= 0.2:
+        return {}
+    planes = zip(motion.names, motion.images, judged.votes, strict=True)
+    return {name: _cut(image, vote, judged.limit) for name, image, vote in planes}
+
+
 def _cut(image: NDArray[np.uint8], vote: Plane, limit: float) -> Mask:
     """The mask (h, w) of an image, from the votes on its grid."""
     cv2 = import_cv2()
@@ -195,12 +184,12 @@ def _cut(image: NDArray[np.uint8], vote: Plane, limit: float) -> Mask:
         return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
 
     moves = cv2.morphologyEx((value > limit).astype(np.uint8), cv2.MORPH_OPEN, disk(2))
-    if moves.mean() < LITTLE:
+    if moves.mean() < 0.002:  # noise
         return np.zeros((height, width), bool)
     label = np.full((height, width), cv2.GC_BGD, np.uint8)
-    label[cv2.dilate(moves, disk(AROUND)) > 0] = cv2.GC_PR_BGD
+    label[cv2.dilate(moves, disk(10)) > 0] = cv2.GC_PR_BGD
     label[moves > 0] = cv2.GC_PR_FGD
-    label[cv2.erode((value > limit + np.log(2)).astype(np.uint8), disk(INSIDE)) > 0] = cv2.GC_FGD
+    label[cv2.erode((value > limit + np.log(2)).astype(np.uint8), disk(5)) > 0] = cv2.GC_FGD
     if (label == cv2.GC_BGD).any():
         cv2.grabCut(image, label, None, np.zeros((1, 65)), np.zeros((1, 65)), 1, cv2.GC_INIT_WITH_MASK)
     inside = ((label == cv2.GC_FGD) | (label == cv2.GC_PR_FGD)).astype(np.uint8)

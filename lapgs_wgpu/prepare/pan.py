@@ -14,8 +14,6 @@ from lapgs_wgpu.prepare.poses import Floats, Ints, Match, Plane
 
 MATCHES = 40  # of a pair of images
 SIGMA = 1.5e-3  # of the longer side: residual from which on a match counts little
-CHAINED = 3  # images before one, from which its rotation may be chained
-ITERATIONS, REWEIGHTED = 30, 12
 FIT = 2.5e-3  # of the longer side: a match up to this residual is explained
 FAR = 6  # images apart: near images of a camera that walks look turned, too
 
@@ -68,8 +66,7 @@ def solve_pan(
 
 def rays(places: Floats, focal: float, radial: float) -> Floats:
     """(m, 3) directions of places (m, 2) in pixels from the middle of the image; their depth is 1."""
-    bent = places / focal
-    flat = bent
+    bent = flat = places / focal
     for _ in range(5):  # r = f u (1 + k u^2), solved for u
         flat = bent / np.maximum(1 + radial * np.square(flat).sum(axis=1, keepdims=True), 0.2)
     return np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
@@ -84,19 +81,19 @@ def _residuals(s: _Sample, R: Floats, focal: float, radial: float) -> tuple[Floa
 
 
 def _chained(s: _Sample, count: int, focal: float, sigma: float) -> Floats:
-    """(n, 3, 3) rotations, each from an image just before: the one with the least sum of distances (Kabsch 1976,
+    """(n, 3, 3) rotations, each from one of the 3 images before: that with the least sum of distances (Kabsch 1976,
     reweighted)."""
     rotations = np.tile(np.eye(3), (count, 1, 1))
     for image in range(1, count):
         rotations[image] = rotations[image - 1]
-        for before in range(image - 1, max(-1, image - 1 - CHAINED), -1):
+        for before in range(image - 1, max(-1, image - 4), -1):
             both = np.flatnonzero((s.a == before) & (s.b == image))
             if len(both) < 8:
                 continue
             one, other = (rays(each[both], focal, 0.0) for each in (s.at_a, s.at_b))
             one, other = (each / np.linalg.norm(each, axis=1, keepdims=True) for each in (one, other))
             turn, weight = np.eye(3), np.ones(len(both))
-            for _ in range(REWEIGHTED):
+            for _ in range(12):
                 U, _, Vt = np.linalg.svd((weight[:, None] * other).T @ one)
                 turn = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
                 weight = 1 / np.maximum(np.linalg.norm(other - one @ turn.T, axis=1), sigma / focal)
@@ -121,7 +118,7 @@ def _refined(s: _Sample, R: Floats, focal: float, sigma: float) -> tuple[Floats,
         return float((e / (1 + e)).sum())
 
     now = cost(r)
-    for _ in range(ITERATIONS):
+    for _ in range(30):
         weight = 1 / (1 + np.square(r).sum(axis=1) / sigma**2)  # square root of the loss's slope
         inverse = 1 / np.maximum(seen[:, 2], 1e-3)
         by_point = np.zeros((len(r), 2, 3))

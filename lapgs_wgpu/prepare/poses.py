@@ -16,11 +16,8 @@ from lapgs_wgpu.progress import counted
 FEATURE_SIDE = 1600  # longer side, pixels: larger images are shrunk to find features
 MOST_FEATURES = 2000  # of an image, the strongest; the time of matching grows with their square
 RATIO, LIKE = 0.9, 0.7  # of the distances of the best and the second match; cosine of two descriptors, at least
-NEIGHBOURS = 6  # an image is matched with so many after it, then with ever more distant ones, each further by GROWTH
-GROWTH = 1.5
 LEAST_ANGLE = 0.5  # degrees between the rays of a point
-FEWEST_IMAGES, FEWEST_MATCHES = 2, 15  # of a reconstruction; of a pair of images that counts
-SEED, TRIALS = 0, 1000  # of RANSAC
+SEED = 0
 Pair = tuple[str, str]
 Ints = NDArray[np.integer]
 Floats = NDArray[np.float64]
@@ -43,8 +40,7 @@ class Reconstruction:
         self.matches: dict[Pair, Ints] = {}
         self._database, self._models = work / "database.db", work / "models"
         self._models.mkdir(parents=True, exist_ok=True)
-        with self.database():  # makes the file
-            pass
+        self.database().close()  # makes the file
         options = colmap.ImageReaderOptions()
         options.camera_model = model
         colmap.import_images(self._database, images, colmap.CameraMode.__members__[lenses], self.names, options)
@@ -79,15 +75,12 @@ class Reconstruction:
                 found.append(nearest(one, other) + before)
                 before += [len(one), len(other)]
             self.matches[pair] = np.concatenate(found)
-        self.use(self.matches)
+        self.verify()
 
-    def hide(self, masks: Mapping[str, Mask]) -> None:
-        """Use the matches outside masks alone."""
-        self.use(without(self.matches, self.places, masks, self.size))
-
-    def use(self, matches: Match) -> None:
-        """Take these matches in place of all earlier ones, and find epipolar geometries that explain many of them."""
+    def verify(self, masks: Mapping[str, Mask] | None = None) -> None:
+        """Find epipolar geometries that explain many of the matches, of those outside masks alone."""
         colmap = self._colmap
+        matches = self.matches if masks is None else without(self.matches, self.places, masks, self.size)
         with self.database() as database:
             database.clear_matches()
             database.clear_two_view_geometries()
@@ -97,18 +90,19 @@ class Reconstruction:
             for (one, other), each in matches.items():
                 database.write_matches(self.ids[one], self.ids[other], each.astype(np.uint32))
         options = colmap.TwoViewGeometryOptions()
-        options.ransac.random_seed, options.ransac.max_num_trials = SEED, TRIALS
+        options.ransac.random_seed, options.ransac.max_num_trials = SEED, 1000
         options.detect_watermark = False  # what follows the camera is no watermark
         colmap.geometric_verification(self._database, two_view_geometry_options=options)
 
     def verified(self) -> dict[Pair, Ints]:
-        """The matches that an epipolar geometry explains, of pairs that share enough of them."""
-        names = {number: name for name, number in self.ids.items()}
+        """The matches that an epipolar geometry explains, of pairs that share 15 or more."""
+        names, verified = {number: name for name, number in self.ids.items()}, {}
         with self.database() as database:
-            geometries = zip(*database.read_two_view_geometries(), strict=True)
-            found = {self._colmap.pair_id_to_image_pair(pair): each.inlier_matches for pair, each in geometries}
-        enough = {pair: matches for pair, matches in found.items() if len(matches) >= FEWEST_MATCHES}
-        return {(names[one], names[other]): matches.astype(np.int64) for (one, other), matches in enough.items()}
+            for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
+                one, other = self._colmap.pair_id_to_image_pair(pair)
+                if len(geometry.inlier_matches) >= 15:
+                    verified[names[one], names[other]] = geometry.inlier_matches.astype(np.int64)
+        return verified
 
     def solve(
         self, focal: float | None = None, *, together: bool = False, held: bool = False, seconds: float = -1
@@ -128,19 +122,18 @@ class Reconstruction:
                     database.update_camera(camera)
         if together:
             options = colmap.GlobalPipelineOptions()
-            parts = options, options.mapper, options.mapper.rotation_averaging, options.mapper.global_positioning
-            for part in parts:
+            mapper, adjustment = options.mapper, options.mapper.bundle_adjustment
+            for part in (options, mapper, mapper.rotation_averaging, mapper.global_positioning):
                 part.random_seed = SEED
-            options.mapper.min_tri_angle_deg = LEAST_ANGLE
-            options.mapper.track_required_tracks_per_view = 150
-            adjustment = options.mapper.bundle_adjustment
+            mapper.min_tri_angle_deg = LEAST_ANGLE
+            mapper.track_required_tracks_per_view = 150
             adjustment.ceres.solver_options.function_tolerance = 1e-4
             adjustment.refine_focal_length = adjustment.refine_extra_params = not held
             found = colmap.global_mapping(self._database, self.images, self._models, options)
         else:
             options = colmap.IncrementalPipelineOptions()
             options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
-            options.min_model_size = FEWEST_IMAGES
+            options.min_model_size = 2
             options.max_runtime_seconds = round(seconds)
             options.ba_refine_focal_length = options.ba_refine_extra_params = not held
             if focal is not None:  # a film: many images from nearly one side, where COLMAP's limits are for photos
@@ -214,9 +207,9 @@ def nearest(one: Plane, other: Plane) -> Ints:
 
 
 def neighbouring_pairs(names: Sequence[str]) -> list[Pair]:
-    """Pairs of images of one camera, in the order of time: near ones all, distant ones ever more rarely."""
-    offsets, distance = list(range(1, NEIGHBOURS + 1)), float(NEIGHBOURS)
-    while (distance := distance * GROWTH) < len(names):
+    """Pairs of images of one camera, in the order of time: each with the 6 after it, and then ever further ones."""
+    offsets, distance = [1, 2, 3, 4, 5, 6], 6.0
+    while (distance := 1.5 * distance) < len(names):
         offsets.append(round(distance))
     return [(names[i], names[i + k]) for k in offsets for i in range(len(names) - k)]
 

@@ -22,9 +22,7 @@ from lapgs_wgpu.prepare.images import LONGER_SIDE, Picture, Shape, extract_in_st
 from lapgs_wgpu.prepare.poses import Reconstruction
 from lapgs_wgpu.progress import say
 
-TIMES = 8  # at which still cameras are compared
 LENS = "SIMPLE_RADIAL"  # few images do not determine more parameters
-MOST_CUT = 0.5  # share of the area of a camera's images that is lost where all get one size
 
 
 def shapes_of(films: Sequence[Film]) -> list[Shape]:
@@ -37,7 +35,7 @@ def shapes_of(films: Sequence[Film]) -> list[Shape]:
     shapes = []
     for film, (w, h) in zip(films, sizes, strict=True):
         w, h = shrunk_size(film.size, math.ceil(max(w, h) * max(width / w, height / h) - 1e-9))
-        if width * height < (1 - MOST_CUT) * w * h:
+        if width * height < 0.5 * w * h:
             raise InputError(
                 f"{film.path} is {size_text(film.size)} pixels, of which {width * height / (w * h):.0%} would be left, "
                 f"since all films get one size, {size_text((width, height))}; leave out those of other proportions."
@@ -50,10 +48,10 @@ def shapes_of(films: Sequence[Film]) -> list[Shape]:
 
 
 def place_still(films: Sequence[Film], images: Path, fps: float, work: Path) -> tuple[list[Picture], Any]:
-    """Compare all cameras at several times. Returns the images and the pycolmap.Reconstruction. Raises InputError."""
+    """Compare all cameras at 8 times. Returns the images and the pycolmap.Reconstruction. Raises InputError."""
     shapes = shapes_of(films)
     cameras = extract_in_step(films, images, fps, shapes)
-    times = evenly(common_times(cameras), TIMES)
+    times = evenly(common_times(cameras), 8)
     groups = [[pictures[time].name for time in times] for pictures in cameras]
     lenses = "SINGLE" if len({shape.shrunk for shape in shapes}) == 1 else "PER_FOLDER"
     shown = {group[0]: group for group in groups}

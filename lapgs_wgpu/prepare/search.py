@@ -18,19 +18,16 @@ FOCALS = 1.0, 1.4, 0.7  # times the width, where EXIF says nothing
 PURE, NEARLY = 0.8, 0.6  # share of the verified matches that turning alone explains: a pan; one, if nothing else fits
 GOOD, SHARP = 0.95, 1.5e-3  # the search ends: share of the images, and the mean error in parts of the longer side
 SECONDS, SECONDS_EACH, CORES = 20.0, 0.6, 2  # of the search: for any film, and for each image, on so many cores
-BENT = 0.4  # first radial coefficient of a lens, at most
-PANORAMA = 3000  # points of a pan
-GAP = 2  # images in a row without a camera, at most, in one part of a film
 
 
 class Found(NamedTuple):
-    """model: a pycolmap.Reconstruction. placed: names of its images, in the order of time. faults: of its path, by the
-    images' numbers in `placed`. error: mean, pixels. focal: at the end, pixels. pan: None where the camera walks.
-    together: all cameras were placed at once. held: the focal length is not the film's, but where the search began."""
+    """model: a pycolmap.Reconstruction. placed: names of its images, in the order of time. faults: number, of its path
+    and its lens. error: mean, pixels. focal: at the end, pixels. pan: None where the camera walks. together: all
+    cameras were placed at once. held: the focal length is not the film's, but where the search began."""
 
     model: Any
     placed: tuple[str, ...]
-    faults: tuple[tuple[str, int], ...]
+    faults: int
     error: float
     focal: float
     pan: Pan | None = None
@@ -51,10 +48,6 @@ def search(source: Reconstruction, *, rival: bool = False) -> Found | None:
     focals = [source.prior] * source.exif + [focal * source.size[0] for focal in FOCALS]
     tries = [(focal, True, False) for focal in focals[:2]] + [(focals[0], way, True) for way in (True, False)]
     tries += [(focal, False, False) for focal in focals] + [(focal, True, False) for focal in focals[2:]]
-
-    def rank(found: Found) -> tuple[int, int, float]:
-        return round(20 * len(found.placed) / count), -len(found.faults), -found.error
-
     best: Found | None = None
     wall, processor, spent, longest = time.monotonic(), time.process_time(), 0.0, 0.0
     for number, (focal, together, held) in enumerate(tries):
@@ -67,9 +60,11 @@ def search(source: Reconstruction, *, rival: bool = False) -> Found | None:
         before, spent = spent, (time.process_time() - processor) / CORES
         longest = max(longest, spent - before)
         if found is not None:
-            faults = f"{len(found.faults)} faults of the path"
-            say(f"{len(found.placed)} of {count} cameras placed, {found.error:.2f} pixels off, {faults}")
-            best = max(best or found, found, key=rank)
+            wrong = f"{found.error:.2f} pixels off, {found.faults} faults of the path"
+            say(f"{len(found.placed)} of {count} cameras placed, {wrong}")
+            best = max(
+                best or found, found, key=lambda one: (round(20 * len(one.placed) / count), -one.faults, -one.error)
+            )
         if best is not None and len(best.placed) >= GOOD * count:
             good = not best.faults and best.error < max(1.0, SHARP * max(source.size))
             if rival or (number and good):
@@ -92,29 +87,28 @@ def described(source: Reconstruction, model: Any) -> Found | None:
     places = np.stack([images[name].projection_center() for name in placed])
     axes = np.stack([images[name].viewing_direction() for name in placed])
     points = np.stack([point.xyz for point in model.points3D.values()])
-    faults = path_faults(places, axes, points, placed)
     camera = next(iter(model.cameras.values()))
-    if camera.model.name == "RADIAL" and abs(camera.params[3]) > BENT:
-        faults.append(("a lens that no camera has", 0))
+    bent = camera.model.name == "RADIAL" and abs(camera.params[3]) > 0.4  # as no camera's lens is
+    faults = len(path_faults(places, axes, points, placed)) + bent
     error = float(model.compute_mean_reprojection_error())
-    return Found(model, placed, tuple(faults), error, camera.mean_focal_length())
+    return Found(model, placed, faults, error, camera.mean_focal_length())
 
 
 def panned(source: Reconstruction, pan: Pan) -> Found:
-    """A pan as a reconstruction, with points of its features on a sphere of radius 1."""
+    """A pan as a reconstruction, with some 3000 points of its features on a sphere of radius 1."""
     rng, size = np.random.default_rng(0), source.size
     lens = Lens(*size, pan.focal, pan.focal, size[0] / 2, size[1] / 2, radial=(pan.radial, 0.0, 0.0))
     rotations = dict(zip(source.names, pan.rotations, strict=True))
     model = source.unpointed({name: (lens, np.pad(R, ((0, 0), (0, 1)))) for name, R in rotations.items()})
     for name, rotation in rotations.items():
         at = source.places[name][:, :2].astype(np.float64)
-        at = at[rng.permutation(len(at))[: max(1, PANORAMA // len(rotations))]]
+        at = at[rng.permutation(len(at))[: max(1, 3000 // len(rotations))]]
         ray = rays(at - np.array(size) / 2, pan.focal, pan.radial)
         points = ray / np.linalg.norm(ray, axis=1, keepdims=True) @ rotation
         column, row = np.clip(at.astype(int), 0, [size[0] - 1, size[1] - 1]).T
         for point, color in zip(points, decode(source.images / name)[row, column], strict=True):
             model.add_point3D(point, import_pycolmap().Track(), color)
-    return Found(model, tuple(rotations), (), 0.0, pan.focal, pan)
+    return Found(model, tuple(rotations), 0, 0.0, pan.focal, pan)
 
 
 def again(source: Reconstruction, found: Found, masks: Mapping[str, Mask]) -> Found | None:
@@ -123,13 +117,11 @@ def again(source: Reconstruction, found: Found, masks: Mapping[str, Mask]) -> Fo
         rest = without(source.verified(), source.places, masks, source.size)
         pan = solve_pan(source.names, source.places, rest, source.size, found.pan.focal)
         return None if pan is None else panned(source, pan)
-    source.hide(masks)
-    seconds = SECONDS + SECONDS_EACH * len(source.names)
-    return _solved(source, found.focal, found.together, found.held, seconds)
+    source.verify(masks)
+    return _solved(source, found.focal, found.together, found.held, SECONDS + SECONDS_EACH * len(source.names))
 
 
 def longest_part(names: Sequence[str], placed: Sequence[str]) -> list[str]:
-    """The longest run of placed images, in which at most GAP images in a row are missing."""
-    number = {name: i for i, name in enumerate(names)}
-    gaps = np.diff([number[name] for name in placed])
-    return max(np.split(np.array(placed), np.flatnonzero(gaps > GAP + 1) + 1), key=len).tolist()
+    """The longest run of placed images, in which at most 2 images in a row are missing."""
+    steps = np.diff([names.index(name) for name in placed])
+    return max(np.split(np.array(placed), np.flatnonzero(steps > 3) + 1), key=len).tolist()
