@@ -19,7 +19,7 @@ class TileLists(NamedTuple):
 
     tile_counts: DeviceArray  # (N,) uint32, tiles of each Gaussian; 0: not visible
     visible: DeviceArray  # (1,) uint32, number of Gaussians in the lists
-    sorted_ids: DeviceArray  # (N,) uint32, the first visible[0] of them, by depth
+    ids: DeviceArray  # (N,) uint32, the first visible[0] of them, by depth
     offsets: DeviceArray  # (N,) uint32, first slot of each of these
     slot_ids: DeviceArray  # (capacity,) uint32, the Gaussian of each slot
     slots: DeviceArray  # (capacity,) uint32, by tile and depth
