@@ -35,10 +35,6 @@ class RasterConfig:
     round_splats: int | None = None
 
     @property
-    def rows(self) -> int:
-        return self.tile_width * self.tile_height // self.lanes
-
-    @property
     def tile_defines(self) -> dict[str, int]:
         return {"TILE_W": self.tile_width, "TILE_H": self.tile_height}
 
@@ -53,9 +49,8 @@ class RasterConfig:
     def raster_defines(self, *, depth: bool) -> dict[str, int]:
         """Return the defines of the passes rasterize and rasterize_bwd. depth: whether to draw it, too."""
         flags = {"SUBGROUPS": self.subgroups, "DEPTH": depth, "LANES_16": self.lanes > 8, "LANES_32": self.lanes > 16}
-        values = {"LANES": self.lanes, "ROWS": self.rows, "POLYNOMIAL_EXP2": self.lane_runs}
-        if self.round_splats:
-            values["ROUND_SPLATS"] = self.round_splats
+        values = {"LANES": self.lanes, "ROWS": self.tile_width * self.tile_height // self.lanes}
+        values |= {"POLYNOMIAL_EXP2": self.lane_runs, "ROUND_SPLATS": self.round_splats or False}
         return self.tile_defines | values | flags
 
 
