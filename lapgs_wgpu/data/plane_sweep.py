@@ -111,8 +111,7 @@ def _surfaces(stills: list[_Still], bounds: tuple[float, float]) -> tuple[Points
         swept = threads.map(partial(_sweep, stills=stills, planes=planes, least=BASELINE * near), stills)
         maps = list(counted(swept, len(stills), "cameras searched for surfaces"))
     tolerance = NEAR * (planes[1] - planes[0])
-    found = _confirmed(stills, maps, tolerance)
-    known = [np.where(kept, depths, np.nan) for kept, depths in zip(found, maps, strict=True)]
+    known = _confirmed(stills, maps, tolerance)
     filled = [_filled(still, depths) for still, depths in zip(stills, known, strict=True)]
     points, surfaces = [], []
     for still, depths, believed in zip(stills, filled, known, strict=True):
@@ -224,18 +223,19 @@ def _votes(places: Array, still: _Still, stills: list[_Still], maps: list[Array]
     return agreeing, beyond
 
 
-def _confirmed(stills: list[_Still], maps: list[Array], most: float) -> list[Mask]:
-    """(H, W) of each camera: inverse depths that others confirm, that fewer see through, and that lie in a patch."""
-    masks = []
+def _confirmed(stills: list[_Still], maps: list[Array], most: float) -> list[Array]:
+    """(H, W) of each camera: inverse depths that others confirm, that fewer see through, and that lie in a patch; NaN
+    elsewhere."""
+    known = []
     for still, depths in zip(stills, maps, strict=True):
-        places = _places(still.camera, depths)
-        agreeing, beyond = (votes.reshape(depths.shape) for votes in _votes(places, still, stills, maps, most))
-        kept = np.isfinite(depths) & (agreeing >= CONFIRMED) & (agreeing > beyond)
-        padded = np.pad(np.where(kept, depths, np.nan), WINDOW // 2, constant_values=np.nan)
+        votes = _votes(_places(still.camera, depths), still, stills, maps, most)
+        agreeing, beyond = (each.reshape(depths.shape) for each in votes)
+        kept = np.where((agreeing >= CONFIRMED) & (agreeing > beyond), depths, np.nan)
+        padded = np.pad(kept, WINDOW // 2, constant_values=np.nan)
         windows = np.lib.stride_tricks.sliding_window_view(padded, (WINDOW, WINDOW))
-        near = (np.abs(windows - np.where(kept, depths, np.nan)[..., None, None]) < most).sum(axis=(2, 3))
-        masks.append(kept & (near >= PATCH))
-    return masks
+        near = (np.abs(windows - kept[..., None, None]) < most).sum(axis=(2, 3))
+        known.append(np.where(near >= PATCH, kept, np.nan))
+    return known
 
 
 def _filled(still: _Still, known: Array) -> Array:
