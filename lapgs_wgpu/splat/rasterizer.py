@@ -94,9 +94,11 @@ class Rasterizer:
     ) -> Drawing:
         """Record the passes that draw an image, once `draw` and `backward` have checked subgroups. move: of the
         Drawing."""
-        kind, (rows, columns) = (camera.width, camera.height, gradient), self._tiles(camera)
-        least = -(-rows // max(1, MAX_BAND_TILES // columns)) if self.config.round_splats else 1
-        self.plans.set_bands(kind, max(self.plans.bands(kind), least))
+        self.plans.turn_to((camera.width, camera.height, gradient))
+        if self.config.round_splats:
+            rows, columns = self._tiles(camera)
+            bands = max(self.plans.now.bands, -(-rows // max(1, MAX_BAND_TILES // columns)))
+            self.plans.now = replace(self.plans.now, bands=bands)
         self._drawings += 1
         drawing = Drawing(
             gaussians,
