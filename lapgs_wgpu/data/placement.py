@@ -157,8 +157,8 @@ def _box(camera: Camera, mask: Mask, points: NDArray[np.float64]) -> tuple[Array
     labels, count = ndimage.label(mask)
     if not count:
         return None
-    rows, columns = np.nonzero(labels == 1 + np.argmax(np.bincount(labels.ravel())[1:]))
-    left, right, top, bottom = (float(v) for v in (columns.min(), columns.max() + 1, rows.min(), rows.max() + 1))
+    rows, columns = ndimage.find_objects(labels)[np.bincount(labels.ravel())[1:].argmax()]
+    left, right, top, bottom = (float(v) for v in (columns.start, columns.stop, rows.start, rows.stop))
     width, height = right - left, bottom - top
     depth, inside = in_view(points, camera)
     x, y = camera.project(points[inside])[0].T

@@ -206,8 +206,7 @@ def check_in_view(dataset: Dataset, points: NDArray[np.floating]) -> list[str]:
     """
     seeing = {camera for camera in dataset.cameras if in_view(points, camera)[1].any()}
     if not seeing:
-        low, high = points.min(axis=0), points.max(axis=0)
-        box = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(low, high, strict=True))
+        box = ", ".join(f"{along.min():.3g} to {along.max():.3g}" for along in points.T)
         raise InputError(
             f"{dataset.name}: none of {len(dataset.train)} training cameras sees where the first Gaussians lie ({box} "
             "along x, y, z); check the poses and their axes, or raise points.box and field.bound."

@@ -36,10 +36,8 @@ class Rendering(NamedTuple):
     means2d: Tensor
 
 
-@functools.cache
-def rasterizer_of(device: Device) -> Rasterizer:
-    """Return the rasterizer that `rasterize` uses on this device. Its buffers are reused by all calls."""
-    return Rasterizer(device)
+# The rasterizer of a device, whose buffers serve all calls of `rasterize`.
+rasterizer_of = functools.cache(Rasterizer)
 
 
 def rasterize(

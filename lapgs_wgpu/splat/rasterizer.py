@@ -26,7 +26,6 @@ from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.raster_config import MAX_BAND_TILES, RasterConfig, raster_config
 
 _RECORD_FLOATS = 8  # rasterize_bwd.wgsl
-_DEPTH_BITS = 32
 _BAND_CAPACITY = 1 << 24  # intersections: 1 GB of buffers in a training, and no submission that a watchdog would end
 _LANES = 64  # workgroup size of the passes over Gaussians and intersections
 
@@ -143,8 +142,7 @@ class Rasterizer:
                 return False
             self.plans.now = replace(plan, rounds=2 * plan.rounds)
             return True
-        bands = plan.bands
-        rows, _ = self._tiles(drawing.camera)
+        bands, (rows, _) = plan.bands, self._tiles(drawing.camera)
         limit = min(self.max_capacity, _BAND_CAPACITY) if bands < rows else self.max_capacity
         if most > limit:
             if bands >= rows:
@@ -176,9 +174,7 @@ class Rasterizer:
         self._color(commands, "color", drawing, arrays, colors=gaussians.sh)
         self._flags_scan(commands, length=length, capacity=n, values=tile_counts, prefix=offsets, total=visible)
         commands.run(Kernel.get(device, "compact"), _groups(n), arrays)
-        _, arrays["ids"] = self._depth_sort(
-            commands, length=visible, capacity=n, bits=_DEPTH_BITS, keys=keys, payload=ids
-        )
+        _, arrays["ids"] = self._depth_sort(commands, length=visible, capacity=n, bits=32, keys=keys, payload=ids)
         scanned = {"values": tile_counts, "indices": arrays["ids"], "prefix": offsets, "total": needed}
         self._offset_scan(commands, length=visible, capacity=n, **scanned)
         commands.run(Kernel.get(device, "duplicate_with_keys", **config.tile_defines), _groups(n), arrays)
