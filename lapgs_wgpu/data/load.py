@@ -113,14 +113,11 @@ def load_dataset(
     )
 
 
-def _summary(layout: str, capture: Capture, places: int, time_source: str, moved: Normalization | None) -> str:
-    """Say how a capture was understood: layout, cameras, times and their source, what is held out, its scale.
-
-    places: of cameras, all together.
-    """
+def _summary(layout: str, capture: Capture, cameras: int, time_source: str, moved: Normalization | None) -> str:
+    """Say how a capture was understood: layout, cameras, times and their source, what is held out, its scale."""
     frames = capture.frames
-    still = len(frames) >= 2 * places
-    number = places if still else len({frame.name.camera for frame in frames})
+    still = len(frames) >= 2 * cameras
+    number = cameras if still else len({frame.name.camera for frame in frames})
     told = f"{number} {'still' if still else 'moving'} camera{'s' * (number > 1)}"
     times = len({frame.time for frame in frames})
     held = [frame.name.camera for frame in frames if frame.split != "train"]

@@ -110,8 +110,7 @@ def near_focus(points: Array, cameras: Sequence[Camera]) -> NDArray[np.bool_]:
 def _filled(cloud: Cloud, cameras: Sequence[Camera]) -> Cloud:
     """Fill up a cloud to MIN_CLOUD_POINTS points.
 
-    The new points are random where views overlap, between the depths of the cloud. Each has the color of the nearest
-    old one.
+    The new points are random where views overlap, between the depths of the cloud, in the color of the nearest one.
     """
     from scipy.spatial import cKDTree  # slow to import
 

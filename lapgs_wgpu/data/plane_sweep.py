@@ -214,8 +214,7 @@ def _votes(places: Array, still: _Still, stills: list[_Still], maps: list[Array]
 
 
 def _confirmed(stills: list[_Still], maps: list[Array], most: float) -> list[Array]:
-    """(H, W) of each camera: inverse depths that others confirm, that fewer see through, and that lie in a patch; NaN
-    elsewhere."""
+    """(H, W) of each camera: inverse depths, in patches, that others confirm and fewer see through; NaN elsewhere."""
     known = []
     for still, depths in zip(stills, maps, strict=True):
         votes = _votes(_places(still.camera, depths), still, stills, maps, most)
@@ -229,8 +228,7 @@ def _confirmed(stills: list[_Still], maps: list[Array], most: float) -> list[Arr
 
 
 def _filled(still: _Still, known: Array) -> Array:
-    """(H, W) inverse depths, where they are NaN by Laplace's equation, whose weights fall across edges of color; NaN
-    where none is known."""
+    """(H, W) inverse depths, NaN filled by Laplace's equation with weights that fall across edges; or all NaN."""
     held = np.isfinite(known).ravel()
     if not held.any():
         return known

@@ -76,8 +76,7 @@ def check_plausible(frames: Sequence[Frame]) -> list[str]:
     highest, told = _highest([frame.image for frame in frames if frame.image.alpha], "alpha")
     if highest < DARK:
         warnings.append(
-            f"images are nearly transparent: {told}, and transparent pixels count as background; save the images "
-            "without alpha."
+            f"images are nearly transparent: {told}, and such pixels count as background; save them without alpha."
         )
     films: dict[str, list[ImageFile]] = {}
     for frame in frames:
@@ -127,10 +126,9 @@ def check_frames(frames: Sequence[Frame]) -> None:
 
 
 def check_cloud(cloud: Cloud, cameras: Sequence[Camera], path: Path, warnings: list[str]) -> Cloud:
-    """Check that a cloud and the training cameras use the same coordinates and scale, and return it.
+    """Check that a cloud and the training cameras use the same coordinates and scale. Raises InputError.
 
-    Of a scan that reaches far beyond what the cameras see, only the points that they see are returned, with a warning.
-    Raises InputError.
+    Returns the cloud; of a scan that reaches far beyond what the cameras see, only what they see, with a warning.
     """
     points = cloud.points.astype(np.float64)
     centres = np.stack([camera.position for camera in cameras])

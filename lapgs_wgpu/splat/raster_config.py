@@ -39,10 +39,7 @@ class RasterConfig:
         return {"TILE_W": self.tile_width, "TILE_H": self.tile_height}
 
     def without_subgroups(self) -> "RasterConfig":
-        """Return the same for a driver that splits workgroups into several subgroups.
-
-        Loops are longer then, and rounds shorter.
-        """
+        """Return the same for a driver that splits workgroups: with longer loops, and therefore shorter rounds."""
         rounds = self.round_splats and self.round_splats * SUBGROUP_TURNS // PLAIN_TURNS
         return replace(self, subgroups=False, round_splats=rounds)
 

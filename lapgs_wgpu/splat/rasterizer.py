@@ -91,8 +91,7 @@ class Rasterizer:
         depth: bool = False,
         gradient: bool = True,
     ) -> Drawing:
-        """Record the passes that draw an image, once `draw` and `backward` have checked subgroups. move: of the
-        Drawing."""
+        """Record the passes of an image, once `draw` and `backward` have checked subgroups. move: as in Drawing."""
         self.plans.turn_to((camera.width, camera.height, gradient))
         if self.config.round_splats:
             rows, columns = self._tiles(camera)
