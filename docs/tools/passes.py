@@ -56,7 +56,7 @@ def passes_of(gaussians: Gaussians[torch.Tensor], camera: Camera) -> Passes:
         drawing = rasterizer.draw(arrays, camera)
     lists = drawing.lists
     image, splats, order, visible, ranges = read_all(
-        [drawing.image, drawing.splats, lists.sorted_ids, lists.visible, lists.ranges]
+        [drawing.image, drawing.splats, lists.ids, lists.visible, lists.ranges]
     )
     config = rasterizer.config
     tiles = camera.height // config.tile_height, camera.width // config.tile_width

@@ -122,9 +122,8 @@ def points_at(camera: Camera, pixels: Array, depths: Array) -> Array:
 def points_in_view(cameras: Sequence[Camera], near: float, far: float, count: int, seed: int) -> Array:
     """Draw (count, 3) random points where the cameras' views overlap, at depths between near and far, world units.
 
-    Each point lies on the ray of a random pixel of a random camera, uniform in 1 / depth, so that things get points in
-    proportion to the pixels that they cover. A point is kept if at least half as many cameras see it as see the point
-    that is seen by most.
+    Each point lies on the ray of a random pixel of a random camera, uniform in 1 / depth: things get points in
+    proportion to the pixels that they cover. It is kept if at least half as many cameras see it as the one most seen.
     """
     rng = np.random.default_rng(seed)
     kept = np.empty((0, 3))

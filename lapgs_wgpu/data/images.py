@@ -145,12 +145,11 @@ def decode(path: Path) -> Pixels:
     """
     with _decoding(path), open(path, "rb") as file:  # not the path: imageio would look into archives
         header = Image.open(file, formats=_FORMATS)
-        transparent = _has_alpha(header)
         if header.mode.startswith("I"):  # Pillow clips 16 bits of gray, and takes the upper 8 of RGB
             gray = (np.asarray(header) >> 8).astype(np.uint8)
             return np.repeat(gray[..., None], 3, axis=2)
         file.seek(0)
-        return iio.imread(file, plugin="pillow", index=0, mode="RGBA" if transparent else "RGB")
+        return iio.imread(file, plugin="pillow", index=0, mode="RGBA" if _has_alpha(header) else "RGB")
 
 
 def decode_gray(path: Path) -> NDArray[Any]:

@@ -82,11 +82,9 @@ class Lens:
         Raises InputError, whose message begins with `where`, if that takes a zoom above MAX_ZOOM.
         """
         width, height = self.width, self.height
-        columns, rows = np.arange(width) + 0.5, np.arange(height) + 0.5
-        top = np.stack([columns, np.full(width, 0.5)], axis=1)
-        left = np.stack([np.full(height, 0.5), rows], axis=1)
-        bottom, right = top + np.array([0, height - 1]), left + np.array([width - 1, 0])
-        border = np.concatenate([top, bottom, left, right])
+        x, y = np.arange(width) + 0.5, np.arange(height) + 0.5
+        sides = np.meshgrid(x, y[[0, -1]]), np.meshgrid(x[[0, -1]], y)
+        border = np.concatenate([np.stack(grid, axis=-1).reshape(-1, 2) for grid in sides])
 
         def covered(zoom: float) -> bool:
             rays = _rays(self._zoomed(zoom), border)
@@ -143,13 +141,13 @@ class Undistortion(NamedTuple):
 
         channels = np.moveaxis(image, -1, 0)
         if len(channels) == 3:
-            values = np.stack([resampled(channel) for channel in channels])
+            values: list[NDArray[Any]] = [resampled(channel) for channel in channels]
         else:
             weight = channels[3].astype(np.float32)
             alpha = resampled(weight)
             covered = np.where(alpha > 0, alpha, 1)
-            values = np.stack([*(resampled(channel * weight) / covered for channel in channels[:3]), alpha])
-        return np.floor(np.moveaxis(values, 0, -1) + 0.5).astype(np.uint8)
+            values = [*(resampled(channel * weight) / covered for channel in channels[:3]), alpha]
+        return np.floor(np.stack(values, axis=-1) + 0.5).astype(np.uint8)
 
 
 def _rays(K: Array, pixels: Array) -> Array:

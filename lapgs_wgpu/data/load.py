@@ -5,14 +5,14 @@ file in `readers` and a line in READERS.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
-from lapgs_wgpu.data.images import SUFFIXES, Pixels, Size, check_film, shrink, shrunk_size
+from lapgs_wgpu.data.images import SUFFIXES, ImageFile, Pixels, Size, check_film, shrink, shrunk_size
 from lapgs_wgpu.data.lens import Lens, Undistortion
-from lapgs_wgpu.data.masks import MOSTLY, Mask, MaskKind, check_masks, find_masks, read_mask
+from lapgs_wgpu.data.masks import MOSTLY, check_masks, find_masks, read_mask
 from lapgs_wgpu.data.normalize import Normalization
 from lapgs_wgpu.data.placement import mover_cube, place
 from lapgs_wgpu.data.readers import apps, colmap, hypernerf, panoptic, poses_bounds, transforms
@@ -60,53 +60,48 @@ def load_dataset(
         raise InputError(f"image_size must be at least 1 pixel, got {image_size}.")
     reader = _reader(folder)
     capture = reader.read(folder, image_size)
-    frames = list(capture.frames)
+    frames, warnings = list(capture.frames), list(capture.warnings)
     if not undistort:
         frames = [dataclasses.replace(frame, lens=frame.lens.idealized) for frame in frames]
-    warnings = list(capture.warnings)
     frames = upright(frames, warnings)
     warnings += check_plausible(frames)
-    frames, time_source = _timed(folder, dataclasses.replace(capture, frames=frames), warnings)
+    frames, time_source = _timed(folder, capture, frames, warnings)
     check_frames(frames)
-    own_masks, own_movers = None if masks is None else Path(masks), None if movers is None else folder / movers
-    frames = _masked(frames, own_masks, own_movers, warnings)
+    frames = _masked(folder, frames, masks, movers, warnings)
 
-    capture = dataclasses.replace(capture, frames=frames)
-    cameras, undistortions = _cameras(capture, shrunk_size(frames[0].image.size, image_size))
-    training = [(camera, frame) for camera, frame in zip(cameras, frames, strict=True) if frame.split == "train"]
-    training_cameras = list(dict.fromkeys(camera for camera, _ in training))
-    if capture.cloud is not None:
+    views = _views(frames, shrunk_size(frames[0].image.size, image_size), shared=capture.shares_cameras)
+    training = [view for view, frame in zip(views, frames, strict=True) if frame.split == "train"]
+    cameras = list(dict.fromkeys(view.camera for view in training))
+    cloud, moving = capture.cloud, None
+    if cloud is not None:
         if capture.own_footage:
-            named = {camera: frame.name.file for camera, frame in zip(cameras, frames, strict=True)}
-            warnings += check_views(capture.cloud, named, capture.source)
-        seen_cloud = check_cloud(capture.cloud, training_cameras, capture.source, warnings)
-        capture = dataclasses.replace(capture, cloud=seen_cloud)
-    moving = None
-    if movers is not None and capture.cloud is not None:
-        by_time = sorted(training, key=lambda pair: pair[1].time or 0.0)
-        seen = [(c, _view(frame, 0, c, undistortions[frame.lens]).moving) for c, frame in by_time]
-        moving = mover_cube(capture.cloud, [(camera, mask) for camera, mask in seen if mask is not None])
-    fit, cloud, depths = place(capture, training_cameras, moving, warnings)
+            named = {view.camera: frame.name.file for view, frame in zip(views, frames, strict=True)}
+            warnings += check_views(cloud, named, capture.source)
+        cloud = check_cloud(cloud, cameras, capture.source, warnings)
+        if movers is not None:
+            by_time = sorted(training, key=lambda view: view.time)
+            moving = mover_cube(cloud, [(view.camera, view.moving) for view in by_time if view.moving is not None])
+    capture = dataclasses.replace(capture, frames=frames, cloud=cloud)
+    fit, cloud, depths = place(capture, cameras, moving, warnings)
     whole = fit if fit is None or capture.moved is None else capture.moved.then(fit)
-    placed = {camera: camera if fit is None else fit.camera(camera) for camera in set(cameras)}
+    placed = {camera: fit.camera(camera) if fit else camera for camera in {view.camera for view in views}}
     # Without a cloud, what stands just before one camera would explain its images alone, and block those beside it.
     if depths is not None and cloud is None:
         near = NEAR_SHARE * depths[0]
         placed = {camera: dataclasses.replace(seen, near=near) for camera, seen in placed.items()}
     order = _by_film(frames, warnings) if capture.own_footage else range(len(frames))
 
-    def views(split: Split) -> tuple[View, ...]:
+    def of_split(split: Split) -> tuple[View, ...]:
         chosen = [i for i in order if frames[i].split == split]
-        return tuple(
-            _view(frames[i], number, placed[cameras[i]], undistortions[frames[i].lens])
-            for number, i in enumerate(chosen)
-        )
+        names = [f"{split}_{frames[i].label or f'{number:05d}'}" for number, i in enumerate(chosen)]
+        found = zip(names, chosen, strict=True)
+        return tuple(dataclasses.replace(views[i], name=name, camera=placed[views[i].camera]) for name, i in found)
 
     return Dataset(
         folder.resolve().name,
-        views("train"),
-        views("test"),
-        val=views("val"),
+        of_split("train"),
+        of_split("test"),
+        val=of_split("val"),
         cloud=cloud,
         depths=depths,
         normalization=whole,
@@ -114,17 +109,15 @@ def load_dataset(
         warnings=tuple(warnings),
         time_source=time_source,
         own_footage=capture.own_footage,
-        summary=_summary(reader.name, capture, cameras, time_source, whole),
+        summary=_summary(reader.name, capture, len(placed), time_source, whole),
     )
 
 
-def _summary(
-    layout: str, capture: Capture, cameras: Sequence[Camera], time_source: str, moved: Normalization | None
-) -> str:
+def _summary(layout: str, capture: Capture, cameras: int, time_source: str, moved: Normalization | None) -> str:
     """Say how a capture was understood: layout, cameras, times and their source, what is held out, its scale."""
-    frames, places = capture.frames, len(set(cameras))
-    still = len(frames) >= 2 * places
-    number = places if still else len({frame.name.camera for frame in frames})
+    frames = capture.frames
+    still = len(frames) >= 2 * cameras
+    number = cameras if still else len({frame.name.camera for frame in frames})
     told = f"{number} {'still' if still else 'moving'} camera{'s' * (number > 1)}"
     times = len({frame.time for frame in frames})
     held = [frame.name.camera for frame in frames if frame.split != "train"]
@@ -154,98 +147,87 @@ def _reader(folder: Path) -> Reader:
         inside = f"; its parent folder {folder.resolve().parent} is one: name that"
     held = {path.suffix.lower() for pattern in ("*.*", "*/*.*") for path in folder.glob(pattern)}
     if not inside and not held.isdisjoint((*SUFFIXES, *FILMS)):
-        inside = (
-            f"; it holds {'films' if held.isdisjoint(SUFFIXES) else 'images'} without poses, which lapgs-prepare finds"
-        )
+        what = "films" if held.isdisjoint(SUFFIXES) else "images"
+        inside = f"; it holds {what} without poses, which lapgs-prepare finds"
     expected = ", or ".join(f"{reader.files} ({reader.name})" for reader in READERS)
     raise InputError(f"{folder} is no scene in a known format: expected {expected}{inside}.")
 
 
-def _timed(folder: Path, capture: Capture, warnings: list[str]) -> tuple[list[Frame], str]:
+def _timed(folder: Path, capture: Capture, frames: Sequence[Frame], warnings: list[str]) -> tuple[list[Frame], str]:
     """Give the frames their times in [0, 1] and, by the rule for own footage, splits where the files state none.
 
     Returns them, and the source of the times. Appends warnings about own footage. Raises InputError.
     """
-    names = [frame.name for frame in capture.frames]
-    times, source = [frame.time for frame in capture.frames if frame.time is not None], capture.time_source
+    names = [frame.name for frame in frames]
+    times, source = [frame.time for frame in frames if frame.time is not None], capture.time_source
     if not times:
         times, source = read_times(names, folder)
     if capture.own_footage:
-        names = as_one_camera(names, times, [frame.place for frame in capture.frames])
+        names = as_one_camera(names, times, [frame.place for frame in frames])
         warnings += disorder(names, times)
         times = in_step(names, times)
     first, last = capture.time_range or (min(times), max(times))
     times = [(time - first) / (last - first) if last > first else 0.0 for time in times]
-    splits: list[Split] = [frame.split for frame in capture.frames if frame.split is not None]
+    splits: list[Split] = [frame.split for frame in frames if frame.split is not None]
     if not splits:
         tested = held_out(names, times)
         splits = ["test" if i in tested else "train" for i in range(len(names))]
     if "train" not in splits:
         raise InputError(f"{folder}: all {len(names)} images are held out; name fewer in its lists of test images.")
-    found = zip(capture.frames, names, times, splits, strict=True)
+    found = zip(frames, names, times, splits, strict=True)
     return [dataclasses.replace(f, name=name, time=time, split=split) for f, name, time, split in found], source
 
 
-def _masked(frames: Sequence[Frame], masks: Path | None, movers: Path | None, warnings: list[str]) -> list[Frame]:
+def _masked(
+    folder: Path, frames: list[Frame], masks: str | Path | None, movers: str | Path | None, warnings: list[str]
+) -> list[Frame]:
     """Give training frames the masks in the user's folder, in place of those that the capture names, and all frames
     those of what moves. Appends warnings. Raises InputError."""
     if masks is not None:
         names = [frame.name.file for frame in frames if frame.split == "train"]
-        found = find_masks(masks, names, "each training image, named as the image")
+        found = find_masks(Path(masks), names, "each training image, named as the image")
         frames = [dataclasses.replace(f, mask=found.get(f.name.file), mask_kind="white") for f in frames]
     if movers is not None:
-        found = find_masks(movers, [frame.name.file for frame in frames], "each image, white where it moves")
+        found = find_masks(folder / movers, [frame.name.file for frame in frames], "each image, white where it moves")
         frames = [dataclasses.replace(frame, moving=found[frame.name.file]) for frame in frames]
     size, kind = frames[0].image.size, frames[0].mask_kind
     ignored = [frame.mask for frame in frames if frame.split == "train" and frame.mask is not None]
     moving = [frame.moving for frame in frames if frame.moving is not None]
     warnings += check_masks(ignored, size, kind, "is left out") + check_masks(moving, size, "white", "moves")
-    return list(frames)
+    return frames
 
 
-def _cameras(capture: Capture, size: Size) -> tuple[list[Camera], dict[Lens, Undistortion]]:
-    """Return the pinhole camera of each frame for images of `size`, (width, height), and how the images of each lens
-    are undistorted at their own size. Raises InputError.
+def _views(frames: Sequence[Frame], size: Size, *, shared: bool) -> list[View]:
+    """Return the view of each frame for images of `size`, (width, height), without its name, and with the pinhole
+    camera in the capture's coordinates. Raises InputError.
 
-    Frames of equal lens and pose share the camera if the capture says so.
+    shared: whether frames of equal lens and pose share the camera.
     """
-    stored = capture.frames[0].image.size
+    stored = frames[0].image.size
     undistortions: dict[Lens, Undistortion] = {}
-    made: dict[tuple[Lens, bytes] | int, Camera] = {}
-    cameras = []
-    for index, frame in enumerate(capture.frames):
+    cameras: dict[tuple[Lens, bytes] | int, Camera] = {}
+    views = []
+    for index, frame in enumerate(frames):
+        assert frame.time is not None
         lens = frame.lens
         if lens not in undistortions:
             resized = lens.resized(*stored)
             undistortions[lens] = Undistortion(resized, resized.pinhole(frame.where))
-        key = (lens, frame.T_cam_world.tobytes()) if capture.shares_cameras else index
-        if key not in made:
-            K, taken = (lens.K, lens.size) if lens.is_pinhole else (undistortions[lens].K, stored)
-            made[key] = Camera(K, frame.T_cam_world, *taken).resized(*size)
-        cameras.append(made[key])
-    return cameras, undistortions
+        undistortion = undistortions[lens]
+        key = (lens, frame.T_cam_world.tobytes()) if shared else index
+        if key not in cameras:
+            K, taken = (lens.K, lens.size) if lens.is_pinhole else (undistortion.K, stored)
+            cameras[key] = Camera(K, frame.T_cam_world, *taken).resized(*size)
+        load = partial(_pixels, frame.image, undistortion, stored, size)
+        mask = partial(read_mask, undistortion=undistortion, stored=stored, size=size)
+        ignored = partial(mask, frame.mask, frame.mask_kind) if frame.mask and frame.split == "train" else None
+        moving = partial(mask, frame.moving, "white", above=MOSTLY) if frame.moving else None
+        views.append(View("", cameras[key], frame.time, str(frame.image), load, ignored, moving))
+    return views
 
 
-def _view(frame: Frame, number: int, camera: Camera, undistortion: Undistortion) -> View:
-    """Make the view of a frame. number: within its split, for its name. camera: in the world's coordinates."""
-    assert frame.time is not None
-    stored, size = frame.image.size, (camera.width, camera.height)
-
-    def pixels() -> Pixels:
-        return shrink(undistortion.apply(frame.image.read(stored)), size)
-
-    def mask(path: Path | None, kind: MaskKind, above: int = 0) -> Callable[[], Mask] | None:
-        return None if path is None else partial(read_mask, path, kind, undistortion, stored, size, above)
-
-    return View(
-        name=f"{frame.split}_{frame.label or f'{number:05d}'}",
-        camera=camera,
-        time=frame.time,
-        source=str(frame.image),
-        load=pixels,
-        ignored=mask(frame.mask, frame.mask_kind) if frame.split == "train" else None,
-        moving=mask(frame.moving, "white", MOSTLY),
-    )
+def _pixels(image: ImageFile, undistortion: Undistortion, stored: Size, size: Size) -> Pixels:
+    return shrink(undistortion.apply(image.read(stored)), size)
 
 
 def _by_film(frames: Sequence[Frame], warnings: list[str]) -> list[int]:

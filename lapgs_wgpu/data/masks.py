@@ -25,19 +25,14 @@ MOSTLY = 127  # level of a shrunk mask, above which most of the pixels mixed the
 CHECKED = 8  # masks that are decoded when a capture is opened
 
 
-def check_mask_folder(folder: Path, what: str) -> None:
-    """Check that a folder of masks exists. what: that needs a mask, for errors. Raises InputError."""
-    if not folder.is_dir():
-        raise InputError(f"{folder} is not a folder; masks need one with a PNG for {what}.")
-
-
 def find_masks(folder: Path, names: Iterable[str], what: str) -> dict[str, Path]:
     """Find the masks of all images by their names: NAME.png or NAME.jpg.png (COLMAP's way) below a folder. Names may
     differ as in `CaptureFiles.find`, and lack the folder where all images lie in one.
 
     what: the images and how masks are named, for errors. Raises InputError: no such folder, or a mask is missing.
     """
-    check_mask_folder(folder, what)
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder; masks need one with a PNG for {what}.")
     files, paths = CaptureFiles(folder), {name: PurePosixPath(name) for name in names}
     one = len({path.parent for path in paths.values()}) == 1
     found = {}

@@ -51,8 +51,7 @@ def place(
     if cube is None or (capture.keeps_coordinates and cube.fits):
         return None, cloud and cloud.rounded, depths
     fit = Normalization(cube.center, BOX / cube.half)
-    cloud = None if cloud is None else fit.cloud(cloud)
-    return fit, cloud, None if depths is None else (depths[0] * fit.scale, depths[1] * fit.scale)
+    return fit, cloud and fit.cloud(cloud), depths and (depths[0] * fit.scale, depths[1] * fit.scale)
 
 
 def _depths(capture: Capture, cameras: Sequence[Camera], warnings: list[str]) -> tuple[float, float] | None:
@@ -81,17 +80,14 @@ def _depths(capture: Capture, cameras: Sequence[Camera], warnings: list[str]) ->
 
 
 def _cube(capture: Capture, cameras: Sequence[Camera], depths: tuple[float, float] | None) -> Cube | None:
-    """Return the cube that the capture fills, in its own coordinates; None if neither files nor cameras tell."""
-    if capture.cloud is not None:
-        return _cube_of_cloud(capture.cloud.points.astype(np.float64), cameras)
-    if depths is not None:
-        return cube_of_points(points_in_view(cameras, *depths, CUBE_POINTS, 0))
-    return cube_in_view(cameras)
+    """Return the cube that the capture fills, in its own coordinates; None if neither files nor cameras tell.
 
-
-def _cube_of_cloud(points: Array, cameras: Sequence[Camera]) -> Cube:
-    """The cube of a cloud's points that at least two cameras see; of a scan that reaches far beyond what the cameras
-    look at, and is seen there, too, that of the points near their focus."""
+    Of a cloud, it is that of the points that at least two cameras see; of a scan that reaches far beyond what the
+    cameras look at, and is seen there, too, that of the points near their focus.
+    """
+    if capture.cloud is None:
+        return cube_of_points(points_in_view(cameras, *depths, CUBE_POINTS, 0)) if depths else cube_in_view(cameras)
+    points = capture.cloud.points.astype(np.float64)
     twice = views_of(points, cameras) >= min(2, len(cameras))
     cube, viewed = cube_of_points(points[twice] if twice.any() else points), cube_in_view(cameras)
     if viewed is None or cube.half <= TOO_WIDE * viewed.half:
@@ -114,8 +110,7 @@ def near_focus(points: Array, cameras: Sequence[Camera]) -> NDArray[np.bool_]:
 def _filled(cloud: Cloud, cameras: Sequence[Camera]) -> Cloud:
     """Fill up a cloud to MIN_CLOUD_POINTS points.
 
-    The new points are random where views overlap, between the depths of the cloud. Each has the color of the nearest
-    old one.
+    The new points are random where views overlap, between the depths of the cloud, in the color of the nearest one.
     """
     from scipy.spatial import cKDTree  # slow to import
 
@@ -161,8 +156,8 @@ def _box(camera: Camera, mask: Mask, points: NDArray[np.float64]) -> tuple[Array
     labels, count = ndimage.label(mask)
     if not count:
         return None
-    rows, columns = np.nonzero(labels == 1 + np.argmax(np.bincount(labels.ravel())[1:]))
-    left, right, top, bottom = (float(v) for v in (columns.min(), columns.max() + 1, rows.min(), rows.max() + 1))
+    rows, columns = ndimage.find_objects(labels)[np.bincount(labels.ravel())[1:].argmax()]
+    left, right, top, bottom = (float(v) for v in (columns.start, columns.stop, rows.start, rows.stop))
     width, height = right - left, bottom - top
     depth, inside = in_view(points, camera)
     x, y = camera.project(points[inside])[0].T

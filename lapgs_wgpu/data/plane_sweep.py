@@ -25,8 +25,7 @@ from lapgs_wgpu.progress import counted, say
 from lapgs_wgpu.splat.camera import Camera
 
 Array = NDArray[np.float64]
-Points = NDArray[np.float32]
-Mask = NDArray[np.bool_]
+Floats = NDArray[np.float32]
 
 SIDE = 128  # pixels, of the images that are compared
 IMAGES = 25  # of a camera, whose median shows what stands still
@@ -49,8 +48,8 @@ FLAT = 1e-8  # product of two variances, below which windows are flat and look l
 class Surface(NamedTuple):
     """points: (N, 3) world units. colors: (N, 3) in [0, 1]. share: of all pixels, those at which a point lies."""
 
-    points: NDArray[np.float32]
-    colors: NDArray[np.float32]
+    points: Floats
+    colors: Floats
     share: float
 
 
@@ -59,7 +58,7 @@ class _Still(NamedTuple):
     variance (H, W) over the window of each pixel."""
 
     camera: Camera
-    colors: NDArray[np.float32]
+    colors: Floats
     gray: Array
     mean: Array
     variance: Array
@@ -79,30 +78,21 @@ def still_surface(dataset: Dataset) -> Surface | None:
     found, share = [(places[kept], colors[kept])], float(kept.mean(axis=1).mean())
     text = f"start: {len(found[0][0])} points on surfaces, {share:.0%} of the pixels of {len(stills)} cameras"
     if dataset.is_rig:
-        moved = [_moved(dataset, stills, dataset.depths, float(t)) for t in np.quantile(dataset.times, MOVER_TIMES)]
-        found += moved
-        if more := sum(len(points) for points, _ in moved):
+        for time in np.quantile(dataset.times, MOVER_TIMES):
+            now = _stills(dataset, at=float(time))
+            changes = [np.abs(one.colors - still.colors).mean(axis=2) for one, still in zip(now, stills, strict=True)]
+            moved = np.stack([_box(change).ravel() > MOVED for change in changes])
+            if moved.any():
+                places, colors, kept = _surfaces(now, dataset.depths)
+                found.append((places[kept & moved], colors[kept & moved]))
+        if more := sum(len(points) for points, _ in found[1:]):
             text += f", and {more} on what moves, at {len(MOVER_TIMES)} times"
     say(text)
     points, rgb = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
     return Surface(points, rgb, share) if share else None
 
 
-def _moved(dataset: Dataset, stills: list[_Still], bounds: tuple[float, float], time: float) -> tuple[Points, Points]:
-    """Points and colors (N, 3) of the surfaces that differ at a time from what stands still.
-
-    bounds: nearest and furthest depth, world units.
-    """
-    now = _stills(dataset, at=time)
-    changes = [np.abs(one.colors - still.colors).mean(axis=2) for one, still in zip(now, stills, strict=True)]
-    moved = np.stack([_box(change).ravel() > MOVED for change in changes])
-    if not moved.any():
-        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
-    places, colors, kept = _surfaces(now, bounds)
-    return places[kept & moved], colors[kept & moved]
-
-
-def _surfaces(stills: list[_Still], bounds: tuple[float, float]) -> tuple[Points, Points, Mask]:
+def _surfaces(stills: list[_Still], bounds: tuple[float, float]) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """Of each camera a point for each pixel (cameras, H W, 3), its color (cameras, H W, 3), and whether a surface is
     there (cameras, H W). bounds: nearest and furthest depth, world units."""
     near, far = bounds
@@ -111,8 +101,7 @@ def _surfaces(stills: list[_Still], bounds: tuple[float, float]) -> tuple[Points
         swept = threads.map(partial(_sweep, stills=stills, planes=planes, least=BASELINE * near), stills)
         maps = list(counted(swept, len(stills), "cameras searched for surfaces"))
     tolerance = NEAR * (planes[1] - planes[0])
-    found = _confirmed(stills, maps, tolerance)
-    known = [np.where(kept, depths, np.nan) for kept, depths in zip(found, maps, strict=True)]
+    known = _confirmed(stills, maps, tolerance)
     filled = [_filled(still, depths) for still, depths in zip(stills, known, strict=True)]
     points, surfaces = [], []
     for still, depths, believed in zip(stills, filled, known, strict=True):
@@ -224,23 +213,22 @@ def _votes(places: Array, still: _Still, stills: list[_Still], maps: list[Array]
     return agreeing, beyond
 
 
-def _confirmed(stills: list[_Still], maps: list[Array], most: float) -> list[Mask]:
-    """(H, W) of each camera: inverse depths that others confirm, that fewer see through, and that lie in a patch."""
-    masks = []
+def _confirmed(stills: list[_Still], maps: list[Array], most: float) -> list[Array]:
+    """(H, W) of each camera: inverse depths, in patches, that others confirm and fewer see through; NaN elsewhere."""
+    known = []
     for still, depths in zip(stills, maps, strict=True):
-        places = _places(still.camera, depths)
-        agreeing, beyond = (votes.reshape(depths.shape) for votes in _votes(places, still, stills, maps, most))
-        kept = np.isfinite(depths) & (agreeing >= CONFIRMED) & (agreeing > beyond)
-        padded = np.pad(np.where(kept, depths, np.nan), WINDOW // 2, constant_values=np.nan)
+        votes = _votes(_places(still.camera, depths), still, stills, maps, most)
+        agreeing, beyond = (each.reshape(depths.shape) for each in votes)
+        kept = np.where((agreeing >= CONFIRMED) & (agreeing > beyond), depths, np.nan)
+        padded = np.pad(kept, WINDOW // 2, constant_values=np.nan)
         windows = np.lib.stride_tricks.sliding_window_view(padded, (WINDOW, WINDOW))
-        near = (np.abs(windows - np.where(kept, depths, np.nan)[..., None, None]) < most).sum(axis=(2, 3))
-        masks.append(kept & (near >= PATCH))
-    return masks
+        near = (np.abs(windows - kept[..., None, None]) < most).sum(axis=(2, 3))
+        known.append(np.where(near >= PATCH, kept, np.nan))
+    return known
 
 
 def _filled(still: _Still, known: Array) -> Array:
-    """(H, W) inverse depths, where they are NaN by Laplace's equation, whose weights fall across edges of color; NaN
-    where none is known."""
+    """(H, W) inverse depths, NaN filled by Laplace's equation with weights that fall across edges; or all NaN."""
     held = np.isfinite(known).ravel()
     if not held.any():
         return known

@@ -12,7 +12,6 @@ from lapgs_wgpu.data.evenly import evenly, some
 from lapgs_wgpu.data.focus import FAR_APART, degrees_apart, spread
 from lapgs_wgpu.data.frames import Frame
 from lapgs_wgpu.data.images import ImageFile, decode, scales_to, size_text
-from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.placement import near_focus
 from lapgs_wgpu.data.poses import AXES_HINT
 from lapgs_wgpu.data.views import Dataset, View
@@ -57,13 +56,15 @@ def check_plausible(frames: Sequence[Frame]) -> list[str]:
     """Warn about principal points far from the middle, about images that are nearly black, as 16 bits that use fewer
     are, or nearly transparent, and about cameras whose images are black."""
     warnings = []
-    off = [frame for frame in {frame.lens: frame for frame in reversed(frames)}.values() if _is_off_center(frame.lens)]
+    by_lens = {frame.lens: frame for frame in reversed(frames)}
+    sides = {lens: (lens.cx / lens.width, lens.cy / lens.height) for lens in by_lens}
+    off = [lens for lens, (x, y) in sides.items() if max(abs(x - 0.5), abs(y - 0.5)) > OFF_CENTER]
     if off:
-        lens = off[-1].lens
+        lens = off[-1]
         warnings.append(
-            f"{off[-1].where}: the principal point ({lens.cx:.5g}, {lens.cy:.5g}) is far from the middle of images of "
-            f"{size_text(lens.size)}, in {len(off)} cameras; unless the images were cut out of larger ones, the "
-            "intrinsics are those of another size, or in other units than pixels."
+            f"{by_lens[lens].where}: the principal point ({lens.cx:.5g}, {lens.cy:.5g}) is far from the middle of "
+            f"images of {size_text(lens.size)}, in {len(off)} cameras; unless the images were cut out of larger ones, "
+            "the intrinsics are those of another size, or in other units than pixels."
         )
     highest, told = _highest([frame.image for frame in frames if frame.image.deep])
     if highest < DARK:
@@ -75,14 +76,18 @@ def check_plausible(frames: Sequence[Frame]) -> list[str]:
     highest, told = _highest([frame.image for frame in frames if frame.image.alpha], "alpha")
     if highest < DARK:
         warnings.append(
-            f"images are nearly transparent: {told}, and transparent pixels count as background; save the images "
-            "without alpha."
+            f"images are nearly transparent: {told}, and such pixels count as background; save them without alpha."
         )
-    return warnings + _black_cameras(frames)
-
-
-def _is_off_center(lens: Lens) -> bool:
-    return max(abs(lens.cx / lens.width - 0.5), abs(lens.cy / lens.height - 0.5)) > OFF_CENTER
+    films: dict[str, list[ImageFile]] = {}
+    for frame in frames:
+        if frame.name.camera and not frame.image.deep:
+            films.setdefault(frame.name.camera, []).append(frame.image)
+    found = {name: _highest(images, most=BLACK_AT) for name, images in films.items() if len(images) > 1}
+    black = [f"{name}: {told}" for name, (highest, told) in found.items() if highest < BLACK]
+    if black:
+        advice = "leave them out" if len(found) > len(black) else "give brighter images"
+        warnings.append(f"{len(black)} of {len(found)} cameras are black, such as {black[0]}: {advice}.")
+    return warnings
 
 
 def _highest(images: Sequence[ImageFile], of: str = "level", most: int = LOOKED_AT) -> tuple[int, str]:
@@ -92,20 +97,6 @@ def _highest(images: Sequence[ImageFile], of: str = "level", most: int = LOOKED_
     highest = max((int(decode(image.path)[..., channels].max()) for image in looked_at), default=255)
     such = f"in {len(looked_at)} of {len(images)}, such as {looked_at[0]}, " if looked_at else ""
     return highest, f"{such}no {of} is above {highest} of 255"
-
-
-def _black_cameras(frames: Sequence[Frame]) -> list[str]:
-    films = dict[str, list[ImageFile]]()
-    for frame in frames:
-        if frame.name.camera and not frame.image.deep:
-            films.setdefault(frame.name.camera, []).append(frame.image)
-    found = {name: _highest(images, most=BLACK_AT) for name, images in films.items() if len(images) > 1}
-    black = {name: told for name, (highest, told) in found.items() if highest < BLACK}
-    return [
-        f"{len(black)} of {len(found)} cameras are black, such as {name}: {told}: "
-        f"{'leave them out' if len(found) > len(black) else 'give brighter images'}."
-        for name, told in [*black.items()][:1]
-    ]
 
 
 def check_frames(frames: Sequence[Frame]) -> None:
@@ -135,10 +126,9 @@ def check_frames(frames: Sequence[Frame]) -> None:
 
 
 def check_cloud(cloud: Cloud, cameras: Sequence[Camera], path: Path, warnings: list[str]) -> Cloud:
-    """Check that a cloud and the training cameras use the same coordinates and scale, and return it.
+    """Check that a cloud and the training cameras use the same coordinates and scale. Raises InputError.
 
-    Of a scan that reaches far beyond what the cameras see, only the points that they see are returned, with a warning.
-    Raises InputError.
+    Returns the cloud; of a scan that reaches far beyond what the cameras see, only what they see, with a warning.
     """
     points = cloud.points.astype(np.float64)
     centres = np.stack([camera.position for camera in cameras])
@@ -182,7 +172,17 @@ def check_times(dataset: Dataset, *, moving: bool) -> list[str]:
             f"between them is a guess; give at least {FEW_TIMES} times, or train with --field static."
         )
     else:
-        warnings += _gaps(dataset, source)
+        edges = np.concatenate([[0.0], times, [1.0]])
+        gaps, usual = np.diff(edges), float(np.median(np.diff(times)))
+        longest = int(np.argmax(gaps))
+        if gaps[longest] > max(GAP, GAP_FACTOR * usual):
+            low, high = edges[longest : longest + 2]
+            tested = sum(low < view.time < high for view in dataset.test)
+            warnings.append(
+                f"{source}: no training image has a time between {low:.4g} and {high:.4g}, though the usual step is "
+                f"{usual:.2g}; the motion there, in {tested} test images too, is unconstrained: add images, or cut the "
+                "clip there."
+            )
     first: dict[tuple[bytes, bytes, float], View] = {}
     keys = [(view.camera.K.tobytes(), view.camera.T_cam_world.tobytes(), view.time) for view in dataset.train]
     pairs = [(first.setdefault(key, view), view) for key, view in zip(keys, dataset.train, strict=True)]
@@ -197,21 +197,6 @@ def check_times(dataset: Dataset, *, moving: bool) -> list[str]:
     return warnings
 
 
-def _gaps(dataset: Dataset, source: str) -> list[str]:
-    edges = np.concatenate([[0.0], dataset.times, [1.0]])
-    gaps, usual = np.diff(edges), float(np.median(np.diff(dataset.times)))
-    longest = int(np.argmax(gaps))
-    if gaps[longest] <= max(GAP, GAP_FACTOR * usual):
-        return []
-    low, high = edges[longest : longest + 2]
-    tested = sum(low < view.time < high for view in dataset.test)
-    return [
-        f"{source}: no training image has a time between {low:.4g} and {high:.4g}, though the usual step is "
-        f"{usual:.2g}; the motion there, in {tested} test images too, is unconstrained: add images, or cut "
-        "the clip there."
-    ]
-
-
 def check_in_view(dataset: Dataset, points: NDArray[np.floating]) -> list[str]:
     """Warn about times at which no training view shows the scene.
 
@@ -219,8 +204,7 @@ def check_in_view(dataset: Dataset, points: NDArray[np.floating]) -> list[str]:
     """
     seeing = {camera for camera in dataset.cameras if in_view(points, camera)[1].any()}
     if not seeing:
-        low, high = points.min(axis=0), points.max(axis=0)
-        box = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(low, high, strict=True))
+        box = ", ".join(f"{along.min():.3g} to {along.max():.3g}" for along in points.T)
         raise InputError(
             f"{dataset.name}: none of {len(dataset.train)} training cameras sees where the first Gaussians lie ({box} "
             "along x, y, z); check the poses and their axes, or raise points.box and field.bound."

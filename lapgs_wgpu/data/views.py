@@ -83,8 +83,7 @@ class Dataset:
 
     @cached_property
     def extent(self) -> float:
-        """1.1 times the largest distance of a training camera from their mean, world units; where all are at one place,
-        that of the scene's own size, BOX."""
+        """1.1 times the largest distance of a training camera from their mean, world units; BOX if it is 0."""
         return 1.1 * spread([view.camera for view in self.train]) or BOX
 
     @cached_property

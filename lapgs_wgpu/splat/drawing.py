@@ -19,7 +19,7 @@ class TileLists(NamedTuple):
 
     tile_counts: DeviceArray  # (N,) uint32, tiles of each Gaussian; 0: not visible
     visible: DeviceArray  # (1,) uint32, number of Gaussians in the lists
-    sorted_ids: DeviceArray  # (N,) uint32, the first visible[0] of them, by depth
+    ids: DeviceArray  # (N,) uint32, the first visible[0] of them, by depth
     offsets: DeviceArray  # (N,) uint32, first slot of each of these
     slot_ids: DeviceArray  # (capacity,) uint32, the Gaussian of each slot
     slots: DeviceArray  # (capacity,) uint32, by tile and depth
@@ -33,8 +33,7 @@ class Drawing:
     image: (4, H, W) red, green, blue, transmittance; with `depth` (5, H, W), the last plane is the sum of weight times
     camera depth. splats: (N, SPLAT_FLOATS), see constants. needed: (3,) uint32 per band: number of intersections;
     unused; whether a list needs more rounds. lists: of the band drawn last. number: counts the rasterizer's drawings.
-    frames: what each band's passes share. move: records a band's frame, given that of `camera`, with the camera moved;
-    None where it stands.
+    frames: what each band's passes share. move: given a band's frame, records that of the moved camera, if it moves.
     """
 
     gaussians: Gaussians[DeviceArray]

@@ -35,27 +35,19 @@ class RasterConfig:
     round_splats: int | None = None
 
     @property
-    def rows(self) -> int:
-        return self.tile_width * self.tile_height // self.lanes
-
-    @property
     def tile_defines(self) -> dict[str, int]:
         return {"TILE_W": self.tile_width, "TILE_H": self.tile_height}
 
     def without_subgroups(self) -> "RasterConfig":
-        """Return the same for a driver that splits workgroups into several subgroups.
-
-        Loops are longer then, and rounds shorter.
-        """
+        """Return the same for a driver that splits workgroups: with longer loops, and therefore shorter rounds."""
         rounds = self.round_splats and self.round_splats * SUBGROUP_TURNS // PLAIN_TURNS
         return replace(self, subgroups=False, round_splats=rounds)
 
     def raster_defines(self, *, depth: bool) -> dict[str, int]:
         """Return the defines of the passes rasterize and rasterize_bwd. depth: whether to draw it, too."""
         flags = {"SUBGROUPS": self.subgroups, "DEPTH": depth, "LANES_16": self.lanes > 8, "LANES_32": self.lanes > 16}
-        values = {"LANES": self.lanes, "ROWS": self.rows, "POLYNOMIAL_EXP2": self.lane_runs}
-        if self.round_splats:
-            values["ROUND_SPLATS"] = self.round_splats
+        values = {"LANES": self.lanes, "ROWS": self.tile_width * self.tile_height // self.lanes}
+        values |= {"POLYNOMIAL_EXP2": self.lane_runs, "ROUND_SPLATS": self.round_splats or False}
         return self.tile_defines | values | flags
 
 

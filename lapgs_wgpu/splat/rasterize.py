@@ -13,7 +13,7 @@ from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.constants import COLOR, CONSTANTS, MEAN, OPACITY, RADIUS
-from lapgs_wgpu.splat.drawing import Drawing, camera_gradient
+from lapgs_wgpu.splat.drawing import camera_gradient
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 
@@ -36,10 +36,8 @@ class Rendering(NamedTuple):
     means2d: Tensor
 
 
-@functools.cache
-def rasterizer_of(device: Device) -> Rasterizer:
-    """Return the rasterizer that `rasterize` uses on this device. Its buffers are reused by all calls."""
-    return Rasterizer(device)
+# The rasterizer of a device, whose buffers serve all calls of `rasterize`.
+rasterizer_of = functools.cache(Rasterizer)
 
 
 def rasterize(
@@ -118,12 +116,15 @@ class Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
         *tensors, background, probe, _, camera, antialiased, depth, device = arguments
-        rasterizer = rasterizer_of(device or open_device())
-        ctx.camera, ctx.antialiased, ctx.depth, ctx.rasterizer = camera, antialiased, depth, rasterizer
-        gaussians = Gaussians(*tensors, antialiased=antialiased)
-        ctx.drawing, planes, splats = _draw(
-            rasterizer, gaussians, background, camera, depth=depth, gradient=probe.requires_grad
-        )
+        rasterizer = ctx.rasterizer = rasterizer_of(device or open_device())
+        gaussians = upload_gaussians(rasterizer.pool, Gaussians(*tensors, antialiased=antialiased))
+        red, green, blue = background.tolist()
+        how = {"depth": depth, "gradient": probe.requires_grad}
+        while True:
+            ctx.drawing = drawing = rasterizer.draw(gaussians, camera, (red, green, blue), **how)
+            planes, splats, *needed = read_all([drawing.image, drawing.splats, *drawing.needed])
+            if not rasterizer.grow_on_overflow(drawing, needed):
+                break
         # By numpy: each operator of torch of this size wakes its threads, and they and the driver's take turns. By
         # planes: three times as fast as a transposed copy.
         rgb, z = np.stack(list(planes[:3]), axis=-1), planes[4].copy() if depth else np.zeros_like(planes[3])
@@ -141,22 +142,23 @@ class Rasterize(torch.autograd.Function):
         d_background = torch.zeros_like(background) if ctx.needs_input_grad[5] else None
         if d_background is not None and d_image is not None:
             d_background += (d_image * transmittance[..., None]).sum((0, 1))
-        rasterizer: Rasterizer = ctx.rasterizer
-        if not rasterizer.holds(ctx.drawing):  # another image was drawn in between
-            gaussians = Gaussians(*tensors, antialiased=ctx.antialiased)
-            ctx.drawing, _, _ = _draw(rasterizer, gaussians, background, ctx.camera, depth=ctx.depth, gradient=True)
-        planes = np.zeros((5 if ctx.depth else 4, *transmittance.shape), np.float32)
+        rasterizer, drawing = ctx.rasterizer, ctx.drawing
+        if not rasterizer.holds(drawing):  # another image was drawn in between
+            gaussians = Gaussians(*tensors, antialiased=drawing.gaussians.antialiased)
+            given = upload_gaussians(rasterizer.pool, gaussians), drawing.camera, drawing.background
+            ctx.drawing = drawing = rasterizer.draw_whole(*given, depth=drawing.depth, gradient=True)
+        planes = np.zeros((5 if drawing.depth else 4, *transmittance.shape), np.float32)
         if d_image is not None:
             planes[:3] = d_image.numpy(force=True).transpose(2, 0, 1)
         if d_alpha is not None:
             planes[3] = d_alpha.numpy(force=True)
-        if ctx.depth and d_depth is not None:
+        if drawing.depth and d_depth is not None:
             planes[4] = d_depth.numpy(force=True)
         d_planes = rasterizer.pool.upload("d_image", planes)
-        gradients = rasterizer.backward(ctx.drawing, d_planes, camera=ctx.needs_input_grad[7])
+        gradients = rasterizer.backward(drawing, d_planes, camera=ctx.needs_input_grad[7])
         d_viewmat = None
         if gradients.camera is not None:
-            d_viewmat = _viewmat_gradient(gradients.camera.read(), ctx.camera).to(background)
+            d_viewmat = _viewmat_gradient(gradients.camera.read(), drawing.camera).to(background)
         by_gaussians, d_means2d = gradient_tensors(read_all(gradients.arrays()), tensors[3])
         return (*by_gaussians, d_background, d_means2d, d_viewmat, *[None] * 4)
 
@@ -173,25 +175,6 @@ def _viewmat_gradient(sums: NDArray[np.float32], camera: Camera) -> Tensor:
     gradient[:3, :3] = R @ (0.5 * np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]))
     gradient[:3, 3] = R @ shift
     return torch.from_numpy(gradient)
-
-
-def _draw(
-    rasterizer: Rasterizer,
-    gaussians: Gaussians[Tensor],
-    background: Tensor,
-    camera: Camera,
-    *,
-    depth: bool,
-    gradient: bool,
-) -> tuple[Drawing, NDArray[np.float32], NDArray[np.float32]]:
-    """Upload, draw until the buffers are large enough, and read back planes (4 or 5, H, W) and splats."""
-    arrays = upload_gaussians(rasterizer.pool, gaussians)
-    red, green, blue = background.tolist()
-    while True:
-        drawing = rasterizer.draw(arrays, camera, (red, green, blue), depth=depth, gradient=gradient)
-        planes, splats, *needed = read_all([drawing.image, drawing.splats, *drawing.needed])
-        if not rasterizer.grow_on_overflow(drawing, needed):
-            return drawing, planes, splats
 
 
 def upload_gaussians(pool: BufferPool, gaussians: Gaussians[Tensor]) -> Gaussians[DeviceArray]:

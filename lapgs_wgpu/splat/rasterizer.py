@@ -3,7 +3,8 @@
 Only `grow_on_overflow` and, the first time that a pass runs, `Rasterizer._subgroup_mismatch` wait for the device.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -19,14 +20,12 @@ from lapgs_wgpu.gpu.radix_sort import RadixSort
 from lapgs_wgpu.gpu.scan import Scan
 from lapgs_wgpu.splat.buffer_plan import BufferPlan, BufferPlans, roomy
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.splat.color_passes import ColorPasses
 from lapgs_wgpu.splat.constants import SPLAT_FLOATS
-from lapgs_wgpu.splat.drawing import Drawing, GaussianGradients, TileLists
+from lapgs_wgpu.splat.drawing import Drawing, GaussianGradients, TileLists, sh_defines
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.raster_config import MAX_BAND_TILES, RasterConfig, raster_config
 
 _RECORD_FLOATS = 8  # rasterize_bwd.wgsl
-_DEPTH_BITS = 32
 _BAND_CAPACITY = 1 << 24  # intersections: 1 GB of buffers in a training, and no submission that a watchdog would end
 _LANES = 64  # workgroup size of the passes over Gaussians and intersections
 
@@ -51,7 +50,6 @@ class Rasterizer:
         self._offset_scan = Scan(device, self.pool, "offsets", "gather")
         self._depth_sort = RadixSort(device, self.pool, "depth sort", lane_runs=self.config.lane_runs)
         self._tile_sort = RadixSort(device, self.pool, "tile sort", lane_runs=self.config.lane_runs)
-        self._colors = ColorPasses(device, self.pool)
         self._drawings = 0
         self._trusted: set[tuple[str, bool, bool]] = set()  # passes whose subgroups were checked
 
@@ -93,8 +91,7 @@ class Rasterizer:
         depth: bool = False,
         gradient: bool = True,
     ) -> Drawing:
-        """Record the passes that draw an image, once `draw` and `backward` have checked subgroups. move: of the
-        Drawing."""
+        """Record the passes of an image, once `draw` and `backward` have checked subgroups. move: as in Drawing."""
         self.plans.turn_to((camera.width, camera.height, gradient))
         if self.config.round_splats:
             rows, columns = self._tiles(camera)
@@ -144,8 +141,7 @@ class Rasterizer:
                 return False
             self.plans.now = replace(plan, rounds=2 * plan.rounds)
             return True
-        bands = plan.bands
-        rows, _ = self._tiles(drawing.camera)
+        bands, (rows, _) = plan.bands, self._tiles(drawing.camera)
         limit = min(self.max_capacity, _BAND_CAPACITY) if bands < rows else self.max_capacity
         if most > limit:
             if bands >= rows:
@@ -161,10 +157,9 @@ class Rasterizer:
         n, capacity, tiles = len(gaussians), drawing.plan.capacity, self._band_tiles(drawing, band)
         frame = pool.varying(f"frame {band}", lambda: self._frame(drawing, band))
         frame = drawing.frames[band] = drawing.move(commands, frame, band) if drawing.move else frame
+        names = ("tile counts", "ids", "depth keys", "offsets")
+        tile_counts, ids, keys, offsets = (pool.array(name, (n,), "uint32") for name in names)
         needed, visible = drawing.needed[band], pool.array("visible", (1,), "uint32")
-        tile_counts, ids, keys, offsets = (
-            pool.array(name, (n,), "uint32") for name in ("tile counts", "ids", "depth keys", "offsets")
-        )
         tile_keys, slot_ids = (pool.array(name, (capacity,), "uint32") for name in ("tile keys", "slot ids"))
         ranges = pool.array("ranges", (tiles + 1, 4), "uint32")
         length = pool.constant(n.to_bytes(4, "little"))
@@ -175,12 +170,10 @@ class Rasterizer:
         if config.round_splats:
             commands.clear(needed)
         commands.run(Kernel.get(device, "project", **config.tile_defines), _groups(n), arrays)
-        self._colors.record(commands, drawing, frame, tile_counts)
+        self._color(commands, "color", drawing, arrays, colors=gaussians.sh)
         self._flags_scan(commands, length=length, capacity=n, values=tile_counts, prefix=offsets, total=visible)
         commands.run(Kernel.get(device, "compact"), _groups(n), arrays)
-        _, arrays["ids"] = self._depth_sort(
-            commands, length=visible, capacity=n, bits=_DEPTH_BITS, keys=keys, payload=ids
-        )
+        _, arrays["ids"] = self._depth_sort(commands, length=visible, capacity=n, bits=32, keys=keys, payload=ids)
         scanned = {"values": tile_counts, "indices": arrays["ids"], "prefix": offsets, "total": needed}
         self._offset_scan(commands, length=visible, capacity=n, **scanned)
         commands.run(Kernel.get(device, "duplicate_with_keys", **config.tile_defines), _groups(n), arrays)
@@ -195,7 +188,20 @@ class Rasterizer:
             if config.round_splats:
                 defines |= {"CONTINUED": number > 0, "LAST_ROUND": number == drawing.plan.rounds - 1}
             commands.run(Kernel.get(device, "rasterize", **defines), tiles, arrays)
-        return TileLists(tile_counts, visible, arrays["ids"], offsets, slot_ids, arrays["slots"], ranges)
+        return TileLists(*(arrays[name] for name in TileLists._fields))
+
+    def _color(
+        self, commands: Commands, name: str, drawing: Drawing, arrays: Mapping[str, DeviceArray], **rows: DeviceArray
+    ) -> None:
+        """Record a pass over colors (N, K, 3), once for each range of Gaussians whose `rows` fit into one binding."""
+        n, sh = len(drawing.gaussians), drawing.gaussians.sh
+        kernel = Kernel.get(self.device, name, **sh_defines(drawing.gaussians.sh_degree))
+        most = self.device.max_binding // (4 * math.prod(sh.shape[1:])) // 64 * 64  # ranges begin at 256 bytes
+        for first in range(0, n, most):
+            count = min(most, n - first)
+            part = self.pool.constant(kernel.uniform("Part", first=first, count=count))
+            bound = {key: array.rows(first, count) for key, array in rows.items()}
+            commands.run(kernel, _groups(count), {**arrays, **bound, "part": part})
 
     def _tiles(self, camera: Camera) -> tuple[int, int]:
         """Return the numbers of rows and columns of tiles."""
@@ -266,35 +272,28 @@ class Rasterizer:
         self, commands: Commands, drawing: Drawing, d_image: DeviceArray, *, camera: bool
     ) -> GaussianGradients:
         """Record the backward passes of the drawing that `record` has recorded last; arguments as for `backward`."""
-        d_splats = self.pool.array("d_splats", (len(drawing.gaussians), SPLAT_FLOATS))
+        gaussians, n = drawing.gaussians, len(drawing.gaussians)
+        d_splats = self.pool.array("d_splats", (n, SPLAT_FLOATS))
         commands.clear(d_splats)
         for band in range(drawing.plan.bands):
             self._backward_band(commands, drawing, band, d_image, d_splats)
             commands.flush()
-        return self._project_bwd(commands, drawing, d_splats, camera=camera)
-
-    def _project_bwd(
-        self, commands: Commands, drawing: Drawing, d_splats: DeviceArray, *, camera: bool
-    ) -> GaussianGradients:
-        gaussians, n = drawing.gaussians, len(drawing.gaussians)
         d_means, d_scales = self.pool.array("d_means", (n, 3)), self.pool.array("d_scales", (n, 3))
         d_quats = self.pool.array("d_quats", (n, 4))
         d_sh = d_camera = None
-        if camera:  # a row for each workgroup of camera_bwd, twice; each half begins at a multiple of 256 bytes
-            d_camera = self.pool.array("d_camera", (2, (_groups(n) + 15) // 16 * 16, 4))
         arrays = gaussians.arrays() | {"frame": drawing.frames[0], "d_splats": d_splats}
         arrays |= {"d_means": d_means, "d_quats": d_quats, "d_scales": d_scales}
         commands.run(Kernel.get(self.device, "project_bwd"), _groups(n), arrays)
-        if d_camera is not None:
+        if camera:  # a row for each workgroup of camera_bwd, twice; each half begins at a multiple of 256 bytes
+            d_camera = self.pool.array("d_camera", (2, (_groups(n) + 15) // 16 * 16, 4))
             commands.clear(d_camera)  # the last rows pad it
-            turned = arrays | {"d_camera": d_camera.rows(0, 1)}
-            commands.run(Kernel.get(self.device, "camera_bwd"), _groups(n), turned)
+            commands.run(Kernel.get(self.device, "camera_bwd"), _groups(n), arrays | {"d_camera": d_camera.rows(0, 1)})
         if gaussians.sh_degree is not None:
             d_sh = self.pool.array("d_sh", gaussians.sh.shape)
-            self._colors.record_bwd(commands, drawing, d_splats, d_means, d_sh)
+            self._color(commands, "color_bwd", drawing, arrays, colors=gaussians.sh, d_colors=d_sh)
         if d_camera is not None:
-            shifted = {"frame": arrays["frame"], "d_means": d_means, "d_camera": d_camera.rows(1, 1)}
-            commands.run(Kernel.get(self.device, "camera_bwd", FORCE=True), _groups(n), shifted)
+            kernel = Kernel.get(self.device, "camera_bwd", FORCE=True)
+            commands.run(kernel, _groups(n), arrays | {"d_camera": d_camera.rows(1, 1)})
         return GaussianGradients(d_splats, d_means, d_quats, d_scales, d_sh, d_camera)
 
     def _backward_band(
@@ -310,14 +309,13 @@ class Rasterizer:
         defines = self.config.raster_defines(depth=drawing.depth)
         kernel = Kernel.get(self.device, "rasterize_bwd", ROUNDS=plan.rounds > 1, **defines)
         gather = Kernel.get(self.device, "gather_gradients", DEPTH=drawing.depth)
-        arrays = lists._asdict() | {"ids": lists.sorted_ids, "frame": drawing.frames[band]}
+        arrays = lists._asdict() | {"frame": drawing.frames[band]}
         arrays |= {"splats": drawing.splats, "image": drawing.image, "d_image": d_image, "d_splats": d_splats}
         arrays |= {"records": records, "record_tails": record_tails}
         arrays["tails"] = self.pool.constant(gather.uniform("Tails", capacity=plan.capacity))
         commands.clear(record_tails.rows(0, plan.capacity))  # no slot has a record yet
         for number in range(plan.rounds):
             if plan.rounds > 1:
-                uniform = kernel.uniform("Piece", number=number, state=tails)
-                arrays["piece"] = self.pool.constant(uniform)
+                arrays["piece"] = self.pool.constant(kernel.uniform("Piece", number=number, state=tails))
             commands.run(kernel, self._band_tiles(drawing, band), arrays)
         commands.run(gather, _groups(len(drawing.gaussians)), arrays)
