@@ -15,6 +15,7 @@ from lapgs_wgpu.io import safe_json_toml
 LARGEST_ENTRY = 1e9  # of a pose: matrix products of larger entries lose all digits
 LARGEST_SIDE = 1e5  # of an image, pixels
 LARGEST_INTRINSIC = 1e6  # pixels
+TINY = 1e-12  # smaller values count as 0
 
 
 @dataclass(frozen=True)
@@ -37,13 +38,17 @@ class Fields:
         """Return a number within bounds. Raises InputError."""
         return number(self.required(name), name, self.where, least, most)
 
+    def time(self, name: str) -> float:
+        """Return a finite number, a time in any unit. Raises InputError."""
+        return number(self.required(name), name, self.where)
+
     def side(self, name: str) -> int:
         """Return a side of an image in pixels. Raises InputError."""
         return round(self.number(name, 1, LARGEST_SIDE))
 
-    def vector(self, name: str, length: int) -> NDArray[np.float64]:
-        """Return (length,) numbers of at most LARGEST_ENTRY. Raises InputError."""
-        return matrix(self.required(name), (length,), name, self.where)
+    def matrix(self, name: str, *shape: int) -> NDArray[np.float64]:
+        """Return numbers of this shape, of at most LARGEST_ENTRY. Raises InputError."""
+        return matrix(self.required(name), shape, name, self.where)
 
     def entries(self, name: str, count: int | None = None) -> list[Any]:
         """Return a list of at least one entry, or of `count`. Raises InputError."""
@@ -56,6 +61,13 @@ class Fields:
     def objects(self, name: str, what: str) -> "list[Fields]":
         """Return a list of objects. what: an entry, for errors. Raises InputError."""
         return [as_fields(value, f"{self.where}, {what} {i}") for i, value in enumerate(self.entries(name))]
+
+    def table(self, what: str, *names: str) -> "list[Fields]":
+        """Return the rows of a table that is stored as columns, lists of equal length. what: a row, for errors."""
+        first = self.entries(names[0])
+        columns = [first, *(self.entries(name, len(first)) for name in names[1:])]
+        rows = zip(*columns, strict=True)
+        return [Fields(dict(zip(names, row, strict=True)), f"{self.where}, {what} {i}") for i, row in enumerate(rows)]
 
 
 def as_fields(value: Any, where: str) -> Fields:

@@ -7,13 +7,14 @@ transform_matrix, since applied_transform was applied to both.
 
 import dataclasses
 import math
+from collections import Counter
 from pathlib import Path, PurePosixPath
 
 from lapgs_wgpu.data.capture_files import CaptureFiles
 from lapgs_wgpu.data.cloud import find_cloud, is_random, read_cloud
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import SIDEWAYS, ImageFile
-from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, LARGEST_SIDE, Fields, number, read_json
+from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, LARGEST_SIDE, Fields, read_json
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.poses import opengl_pose
 from lapgs_wgpu.data.stamps import ImageName, image_names
@@ -30,28 +31,24 @@ INTRINSICS = {  # bounds, in pixels of an image w x h
 }  # fmt: skip
 
 
-def _read_frames(data: Fields, files: CaptureFiles, time: str) -> list[Frame | None]:
-    """Return the frame of each entry of a transforms file, None where its image does not exist.
+def _read_frames(data: Fields, files: CaptureFiles, time: str) -> dict[int, Frame]:
+    """Return the frames of a transforms file whose images exist, by the places of their entries.
 
     time: the field of the times, in all entries or in none. Raises InputError.
     """
     entries = data.objects("frames", "frame")
     timed = sum(_states(entry, time) for entry in entries)
-    frames: list[Frame | None] = []
-    for entry in entries:
+    frames = {}
+    for index, entry in enumerate(entries):
         if timed and not _states(entry, time):
             raise InputError(
                 f"{entry.where} has no field {time}, though {timed} of {len(entries)} frames have it; give it for all."
             )
-        stated = number(entry.required(time), time, entry.where) if timed else None
-        pose = opengl_pose(entry.required("transform_matrix"), entry.where)
-        found = files.image(entry, "file_path")
-        if found is None:
-            frames.append(None)
-            continue
-        name, image = found
-        lens, sized = read_lens(entry, data, image)
-        frames.append(Frame(image, lens, pose, entry.where, ImageName(name), time=stated, states_size=sized))
+        stated, pose = entry.time(time) if timed else None, opengl_pose(entry)
+        if found := files.image(entry, "file_path"):
+            name, image = found
+            lens, sized = read_lens(entry, data, image)
+            frames[index] = Frame(image, lens, pose, entry.where, ImageName(name), time=stated, states_size=sized)
     return frames
 
 
@@ -65,21 +62,14 @@ def read_lens(frame: Fields, shared: Fields, image: ImageFile) -> tuple[Lens, bo
     A missing size is the image's; the focal length is that of camera_angle_x (radians) where fl_x is missing. Raises
     InputError, also for other lens models.
     """
-
-    def source(name: str) -> Fields:
-        return frame if name in frame else shared
-
-    model = source("camera_model").values.get("camera_model", "OPENCV")
-    if model not in MODELS or source("is_fisheye").values.get("is_fisheye"):
+    both = Fields(shared.values | frame.values, frame.where)
+    model = both.values.get("camera_model", "OPENCV")
+    if model not in MODELS or both.values.get("is_fisheye"):
         named = shown(model) if model not in MODELS else "is_fisheye"
         raise InputError(
             f"{frame.where}: camera_model {named} is none that is read ({', '.join(MODELS)}); undistort the images."
         )
-    values = {
-        name: source(name).number(name, least, most)
-        for name, (least, most) in INTRINSICS.items()
-        if source(name).values.get(name) is not None
-    }
+    values = {name: both.number(name, *bounds) for name, bounds in INTRINSICS.items() if _states(both, name)}
     centered = {"cx", "cy"} <= values.keys()
     size = image.size
     if centered and image.orientation >= SIDEWAYS:  # of the two sizes, that whose middle is nearer
@@ -88,12 +78,11 @@ def read_lens(frame: Fields, shared: Fields, image: ImageFile) -> tuple[Lens, bo
     if "fl_x" in values:
         fx = values["fl_x"]
     else:
-        angle = source("camera_angle_x")
-        if "camera_angle_x" not in angle:
+        if "camera_angle_x" not in both:
             raise InputError(f"{frame.where} and {shared.where} have neither fl_x nor camera_angle_x; give one.")
-        fov_x = angle.number("camera_angle_x")
+        fov_x = both.number("camera_angle_x")
         if not 1e-6 < fov_x < math.pi:
-            raise InputError(f"{angle.where}: camera_angle_x must be radians between 0 and pi, got {fov_x:g}.")
+            raise InputError(f"{frame.where}: camera_angle_x must be radians between 0 and pi, got {fov_x:g}.")
         fx = float(intrinsics_of_fov(fov_x, width, height)[0, 0])
     k1, k2, k3, p1, p2 = (values.get(name, 0.0) for name in ("k1", "k2", "k3", "p1", "p2"))
     lens = Lens(
@@ -114,18 +103,17 @@ def _read_nerfstudio(folder: Path, image_size: int | None) -> Capture:
     read = _read_frames(data, files, time)
     warnings = files.left_out(len(entries), path)
     frames = [
-        dataclasses.replace(frame, mask=files.optional(entry, "mask_path"), mask_kind="black")
-        for frame, entry in zip(read, entries, strict=True)
-        if frame is not None
+        dataclasses.replace(frame, mask=files.optional(entries[index], "mask_path"), mask_kind="black")
+        for index, frame in read.items()
     ]
     names = [frame.name.file for frame in frames]
     if len(set(names)) < len(names):
-        twice = next(name for i, name in enumerate(names) if name in names[:i])
+        twice = Counter(names).most_common(1)[0][0]
         raise InputError(f"{path}: {len(names)} frames name {len(set(names))} images; keep one frame of {twice}.")
     if splits := _splits(data, names, files):
         unlisted = [name for name in names if name not in splits]
-        frames = [dataclasses.replace(frame, split=splits.get(frame.name.file)) for frame in frames]
-        frames = [frame for frame in frames if frame.split is not None]
+        listed = [frame for frame in frames if frame.name.file in splits]
+        frames = [dataclasses.replace(frame, split=splits[frame.name.file]) for frame in listed]
         if unlisted:
             warnings.append(
                 f"{path}: {len(unlisted)} of {len(names)} images, such as {unlisted[0]}, are in none of "
@@ -148,30 +136,33 @@ def _read_nerfstudio(folder: Path, image_size: int | None) -> Capture:
 def _splits(data: Fields, names: list[str], files: CaptureFiles) -> dict[str, Split]:
     """Return the split of each image, as the file's lists state it; {} if they hold nothing out.
 
-    An image in no list is for training, but missing here if the file lists those for training.
+    An image in no list is for training, but missing here if the file lists those for training. Raises InputError for a
+    name that no frame has.
     """
-    test, validation, train = (_listed(data, f"{split}_filenames", names, files) for split in ("test", "val", "train"))
-    if not test:  # one list is enough to measure by
-        test, validation = validation, []
-    if not test:
+    known, stated = set(names), {_path(str(entry["file_path"])) for entry in data.values["frames"]}
+    lists: dict[Split, list[str]] = {"train": [], "val": [], "test": []}
+    for split, found in lists.items():
+        field = f"{split}_filenames"
+        listed = data.values.get(field) or []
+        if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
+            raise InputError(f"{data.where}: {field} must be a list of names, got {shown(listed)}.")
+        for name in listed:
+            if (file := files.find(name)) in known:
+                found.append(str(file))
+            elif _path(name) not in stated:
+                raise InputError(
+                    f"{data.where}: {field} names {name[:80]}, none of its {len(names)} frames; remove it."
+                )
+    if not lists["test"]:  # one list is enough to measure by
+        lists["test"], lists["val"] = lists["val"], []
+    if not lists["test"]:
         return {}
-    splits: dict[str, Split] = dict.fromkeys(train or names, "train")
-    return splits | dict.fromkeys(validation, "val") | dict.fromkeys(test, "test")
+    lists["train"] = lists["train"] or names
+    return {name: split for split, found in lists.items() for name in found}
 
 
-def _listed(data: Fields, field: str, names: list[str], files: CaptureFiles) -> list[str]:
-    """Return the images that a list of the file names and that exist. Raises InputError for one that no frame names."""
-    listed = data.values.get(field) or []
-    if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
-        raise InputError(f"{data.where}: {field} must be a list of names, got {shown(listed)}.")
-    known, found = set(names), []
-    stated = {PurePosixPath(str(entry["file_path"]).replace("\\", "/")) for entry in data.values["frames"]}
-    for name in listed:
-        if (file := files.find(name)) in known:
-            found.append(str(file))
-        elif PurePosixPath(name.replace("\\", "/")) not in stated:
-            raise InputError(f"{data.where}: {field} names {name[:80]}, none of its {len(names)} frames; remove it.")
-    return found
+def _path(name: str) -> PurePosixPath:
+    return PurePosixPath(name.replace("\\", "/"))
 
 
 # D-NeRF
@@ -211,16 +202,14 @@ def _read_split(folder: Path, split: Split, warnings: list[str]) -> list[Frame]:
             f"{path} does not exist, which a D-NeRF scene needs; if there is one file alone, name it transforms.json, "
             "and every eighth image is held out."
         )
-    read = _read_frames(read_json(path), files, "time")
-    frames = []
-    for index, frame in enumerate(read):
-        if frame is None:
-            continue
-        time = index / max(len(read) - 1, 1) if frame.time is None else frame.time
+    data, frames = read_json(path), []
+    read, count = _read_frames(data, files, "time"), len(data.values["frames"])
+    for index, frame in read.items():
+        time = index / max(count - 1, 1) if frame.time is None else frame.time
         if not 0 <= time <= 1:
             raise InputError(f"{frame.where}: time must lie in [0, 1], got {time:g}; divide by the clip's duration.")
         frames.append(dataclasses.replace(frame, time=time, split=split, label=f"{index:03d}"))
-    warnings += files.left_out(len(read), path)
+    warnings += files.left_out(count, path)
     return frames
 
 
