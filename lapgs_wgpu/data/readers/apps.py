@@ -31,10 +31,11 @@ def _read_record3d(folder: Path, image_size: int | None) -> Capture:
     data = read_json(path)
     pictures = [file for file in listed(images) if file.suffix.lower() in SUFFIXES]
     files = {int(file.stem): file for file in pictures if file.stem.isascii() and file.stem.isdigit()}
+    count = len(data.entries("poses"))
+    if max(files) >= count:
+        raise InputError(f"{path} has {count} poses, but there is {files[max(files)]}; export them again.")
     optional = [name for name in ("frameTimestamps", "perFrameIntrinsicCoeffs") if data.values.get(name)]
     entries = data.table("frame", "poses", *optional)
-    if max(files) >= len(entries):
-        raise InputError(f"{path} has {len(entries)} poses, but there is {files[max(files)]}; export them again.")
     size, timed, frames = (data.side("w"), data.side("h")), "frameTimestamps" in optional, []
     for index, file in sorted(files.items()):
         entry = entries[index]
@@ -47,8 +48,8 @@ def _read_record3d(folder: Path, image_size: int | None) -> Capture:
         pose, name = world_to_camera(R_world_cam, np.array(position)), ImageName(f"{images.name}/{file.name}")
         time = entry.time("frameTimestamps") if timed else index / data.number("fps", 1e-9, 1e5)
         frames.append(Frame(check_image(file), Lens(*size, *K.tolist()), pose, entry.where, name, time))
-    absent = len(entries) - len(files)
-    warnings = [f"{images} holds {len(files)} images for {len(entries)} poses; the other poses are left out."]
+    absent = count - len(files)
+    warnings = [f"{images} holds {len(files)} images for {count} poses; the other poses are left out."]
     return Capture(
         frames,
         source=path,

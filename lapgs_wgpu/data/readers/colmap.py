@@ -72,22 +72,14 @@ def _frames(
     """Return the images with a pose, their own or that of their still camera. Appends a warning about those without."""
     places = {file: place_of(image.T_cam_world) for file, image in registered.items()}
     names = image_names(files, places)
-    first: dict[str, ColmapImage] = {}  # of each camera
-    for name in names:
-        if name.file in registered:
-            first.setdefault(name.camera, registered[name.file])
+    first = {name.camera: registered[name.file] for name in reversed(names) if name.file in registered}
     still = first if stand_still(names, places) else {}
-    frames: list[Frame] = []
-    left_out: list[str] = []
-    for name in names:
-        posed = registered.get(name.file) or still.get(name.camera)
-        if posed is None:
-            left_out.append(name.file)
-            continue
-        where = f"{model.cameras_file}, camera {posed.camera},"
-        frames.append(
-            Frame(check_image(images / name.file), model.cameras[posed.camera], posed.T_cam_world, where, name)
-        )
+    posed = {name: found for name in names if (found := registered.get(name.file) or still.get(name.camera))}
+    frames = []
+    for name, image in posed.items():
+        lens, where = model.cameras[image.camera], f"{model.cameras_file}, camera {image.camera},"
+        frames.append(Frame(check_image(images / name.file), lens, image.T_cam_world, where, name))
+    left_out = [name.file for name in names if name not in posed]
     if left_out:
         warnings.append(
             f"{len(left_out)} of {len(files)} images below {images} are left out, such as {left_out[0]}: "

@@ -62,14 +62,18 @@ def read_lens(frame: Fields, shared: Fields, image: ImageFile) -> tuple[Lens, bo
     A missing size is the image's; the focal length is that of camera_angle_x (radians) where fl_x is missing. Raises
     InputError, also for other lens models.
     """
-    both = Fields(shared.values | frame.values, frame.where)
-    model = both.values.get("camera_model", "OPENCV")
-    if model not in MODELS or both.values.get("is_fisheye"):
+
+    def source(name: str) -> Fields:
+        return frame if name in frame else shared
+
+    model = source("camera_model").values.get("camera_model", "OPENCV")
+    if model not in MODELS or source("is_fisheye").values.get("is_fisheye"):
         named = shown(model) if model not in MODELS else "is_fisheye"
         raise InputError(
             f"{frame.where}: camera_model {named} is none that is read ({', '.join(MODELS)}); undistort the images."
         )
-    values = {name: both.number(name, *bounds) for name, bounds in INTRINSICS.items() if _states(both, name)}
+    stated = [name for name in INTRINSICS if _states(source(name), name)]
+    values = {name: source(name).number(name, *INTRINSICS[name]) for name in stated}
     centered = {"cx", "cy"} <= values.keys()
     size = image.size
     if centered and image.orientation >= SIDEWAYS:  # of the two sizes, that whose middle is nearer
@@ -78,11 +82,12 @@ def read_lens(frame: Fields, shared: Fields, image: ImageFile) -> tuple[Lens, bo
     if "fl_x" in values:
         fx = values["fl_x"]
     else:
-        if "camera_angle_x" not in both:
+        angle = source("camera_angle_x")
+        if "camera_angle_x" not in angle:
             raise InputError(f"{frame.where} and {shared.where} have neither fl_x nor camera_angle_x; give one.")
-        fov_x = both.number("camera_angle_x")
+        fov_x = angle.number("camera_angle_x")
         if not 1e-6 < fov_x < math.pi:
-            raise InputError(f"{frame.where}: camera_angle_x must be radians between 0 and pi, got {fov_x:g}.")
+            raise InputError(f"{angle.where}: camera_angle_x must be radians between 0 and pi, got {fov_x:g}.")
         fx = float(intrinsics_of_fov(fov_x, width, height)[0, 0])
     k1, k2, k3, p1, p2 = (values.get(name, 0.0) for name in ("k1", "k2", "k3", "p1", "p2"))
     lens = Lens(
