@@ -47,8 +47,15 @@ class Fields:
         return round(self.number(name, 1, LARGEST_SIDE))
 
     def matrix(self, name: str, *shape: int) -> NDArray[np.float64]:
-        """Return numbers of this shape, of at most LARGEST_ENTRY. Raises InputError."""
-        return matrix(self.required(name), shape, name, self.where)
+        """Return a list, or lists in lists, as numbers of this shape, of at most LARGEST_ENTRY. Raises InputError."""
+        entries = [self.required(name)]
+        for i, length in enumerate(shape):
+            if bad := [row for row in entries if not isinstance(row, list) or len(row) != length]:
+                needed = " rows of ".join(map(str, shape[i:]))
+                raise InputError(f"{self.where}: {name} must be {needed} numbers, got {shown(bad[0])}.")
+            entries = [entry for row in entries for entry in row]
+        each, bounds = f"each entry of {name}", (-LARGEST_ENTRY, LARGEST_ENTRY)
+        return np.array([number(entry, each, self.where, *bounds) for entry in entries]).reshape(shape)
 
     def entries(self, name: str, count: int | None = None) -> list[Any]:
         """Return a list of at least one entry, or of `count`. Raises InputError."""
@@ -100,14 +107,3 @@ def number(
     if not least <= converted <= most:  # true for NaN, too
         raise InputError(f"{where}: {name} must be a finite number from {least:g} to {most:g}, got {converted:g}.")
     return converted
-
-
-def matrix(value: Any, shape: tuple[int, ...], name: str, where: str | Path) -> NDArray[np.float64]:
-    """Convert a JSON list, or lists in lists, to numbers of this shape, of at most LARGEST_ENTRY. Raises InputError."""
-    if not isinstance(value, list) or len(value) != shape[0]:
-        needed = " rows of ".join(map(str, shape))
-        raise InputError(f"{where}: {name} must be {needed} numbers, got {shown(value)}.")
-    if len(shape) > 1:
-        return np.stack([matrix(row, shape[1:], name, where) for row in value])
-    bounds = -LARGEST_ENTRY, LARGEST_ENTRY
-    return np.array([number(entry, f"each entry of {name}", where, *bounds) for entry in value])

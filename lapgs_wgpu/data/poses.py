@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.json_fields import Fields, matrix
+from lapgs_wgpu.data.json_fields import Fields
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import rotation_matrix
 
@@ -62,10 +62,10 @@ def world_to_camera(R_world_cam: Array, position: Array) -> Array:
 def opengl_pose(entry: Fields) -> Array:
     """The (4, 4) pose in OpenCV axes of an entry's transform_matrix: camera to world, OpenGL axes, its last row may be
     missing. Raises InputError unless it is a rigid motion."""
-    value, name = entry.required("transform_matrix"), f"{entry.where}: transform_matrix"
-    if isinstance(value, list) and len(value) == 3:
-        value = [*value, [0, 0, 0, 1]]
-    T = matrix(value, (4, 4), "transform_matrix", entry.where)
+    rows, name = entry.required("transform_matrix"), f"{entry.where}: transform_matrix"
+    if isinstance(rows, list) and len(rows) == 3:
+        entry = Fields({"transform_matrix": [*rows, [0, 0, 0, 1]]}, entry.where)
+    T = entry.matrix("transform_matrix", 4, 4)
     if np.abs(T[3] - [0, 0, 0, 1]).max() > ROTATION_TOLERANCE:
         got = " ".join(f"{x:g}" for x in T[3])
         raise InputError(f"{name} must end with the row 0 0 0 1, got {got}; the position stands at the right.")

@@ -65,30 +65,27 @@ def is_model(folder: Path) -> bool:
 def read_model(folder: Path) -> ColmapModel:
     """The sparse model in a folder; binary files go before text. Raises InputError."""
     binary = (folder / "cameras.bin").is_file()
-    files = {name: folder / f"{name}.{'bin' if binary else 'txt'}" for name in ("cameras", "images", "points3D")}
-    for path in files.values():
+    files = [folder / f"{name}.{'bin' if binary else 'txt'}" for name in ("cameras", "images", "points3D")]
+    cameras_file, images_file, points_file = files
+    for path in files:
         if not path.is_file():
-            raise InputError(f"{path} does not exist, but {files['cameras']} does; copy it, too.")
+            raise InputError(f"{path} does not exist, but {cameras_file} does; copy it, too.")
     try:
-        cameras = dict((_binary_cameras if binary else _text_cameras)(files["cameras"]))
-        images = list((_binary_images if binary else _text_images)(files["images"]))
-        rows = list((_binary_points if binary else _text_points)(files["points3D"]))
+        cameras = dict((_binary_cameras if binary else _text_cameras)(cameras_file))
+        images = list((_binary_images if binary else _text_images)(images_file))
+        rows = list((_binary_points if binary else _text_points)(points_file))
     except OSError as error:
         raise InputError(f"{error.filename or folder} cannot be read ({error.strerror or error}).") from error
     for image in images:
         if image.camera not in cameras:
-            raise InputError(
-                f"{image.where} names camera {image.camera}, none of {len(cameras)} in {files['cameras']}."
-            )
+            raise InputError(f"{image.where} names camera {image.camera}, none of {len(cameras)} in {cameras_file}.")
     points, colors = np.split(np.array(rows, np.float64).reshape(-1, 6), 2, axis=1)
     bad = np.flatnonzero(~(np.abs(points) <= LARGEST_ENTRY).all(axis=1))  # true for NaN, too
     if len(bad):
-        raise InputError(
-            f"{files['points3D']}: {len(bad)} of {len(points)} are not finite, first {bad[0]}; remove them."
-        )
+        raise InputError(f"{points_file}: {len(bad)} of {len(points)} are not finite, first {bad[0]}; remove them.")
     levels = np.clip(np.nan_to_num(colors), 0, 255).astype(np.uint8)
     cloud = Cloud(points, (levels / 255).astype(np.float32)) if len(points) else None
-    return ColmapModel(cameras, images, cloud, *files.values())
+    return ColmapModel(cameras, images, cloud, cameras_file, images_file, points_file)
 
 
 def _camera(where: str, model: str, width: float, height: float, values: Sequence[float | str]) -> Lens:
@@ -126,9 +123,9 @@ def _lines(path: Path) -> Iterator[tuple[str, str]]:
     """Yield the place of each line, for errors, and the line; neither comments nor empty ones."""
     try:
         with path.open(encoding="utf-8") as file:
-            for number, line in enumerate(file, start=1):
+            for at, line in enumerate(file, start=1):
                 if line.strip() and not line.startswith("#"):
-                    yield f"{path}, line {number}", line.strip()
+                    yield f"{path}, line {at}", line.strip()
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not text ({error.reason}); copy it or export the model again.") from None
 

@@ -7,7 +7,6 @@ transform_matrix, since applied_transform was applied to both.
 
 import dataclasses
 import math
-from collections import Counter
 from pathlib import Path, PurePosixPath
 
 from lapgs_wgpu.data.capture_files import CaptureFiles
@@ -107,27 +106,23 @@ def _read_nerfstudio(folder: Path, image_size: int | None) -> Capture:
     time = "time" if any(_states(entry, "time") for entry in entries) else "timestamp"
     read = _read_frames(data, files, time)
     warnings = files.left_out(len(entries), path)
-    frames = [
-        dataclasses.replace(frame, mask=files.optional(entries[index], "mask_path"), mask_kind="black")
-        for index, frame in read.items()
-    ]
-    names = [frame.name.file for frame in frames]
-    if len(set(names)) < len(names):
-        twice = Counter(names).most_common(1)[0][0]
-        raise InputError(f"{path}: {len(names)} frames name {len(set(names))} images; keep one frame of {twice}.")
-    if splits := _splits(data, names, files):
-        unlisted = [name for name in names if name not in splits]
-        listed = [frame for frame in frames if frame.name.file in splits]
-        frames = [dataclasses.replace(frame, split=splits[frame.name.file]) for frame in listed]
-        if unlisted:
+    frames: dict[str, Frame] = {}
+    for index, frame in read.items():
+        file, mask = frame.name.file, files.optional(entries[index], "mask_path")
+        if file in frames:
+            raise InputError(f"{frame.where} and {frames[file].where} name the same image, {file}; keep one of them.")
+        frames[file] = dataclasses.replace(frame, mask=mask, mask_kind="black")
+    if splits := _splits(data, list(frames), files):
+        if unlisted := [file for file in frames if file not in splits]:
             warnings.append(
-                f"{path}: {len(unlisted)} of {len(names)} images, such as {unlisted[0]}, are in none of "
+                f"{path}: {len(unlisted)} of {len(frames)} images, such as {unlisted[0]}, are in none of "
                 "train_filenames, val_filenames and test_filenames, and are left out."
             )
-    named = image_names([frame.name.file for frame in frames], {frame.name.file: frame.place for frame in frames})
+        frames = {f: dataclasses.replace(frame, split=splits[f]) for f, frame in frames.items() if f in splits}
+    names = image_names(list(frames), {file: frame.place for file, frame in frames.items()})
     cloud = files.optional(data, "ply_file_path")
     return Capture(
-        [dataclasses.replace(frame, name=name) for frame, name in zip(frames, named, strict=True)],
+        [dataclasses.replace(frames[name.file], name=name) for name in names],
         cloud=None if cloud is None else read_cloud(cloud),
         source=cloud or path,
         warnings=warnings,
