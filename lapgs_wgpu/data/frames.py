@@ -16,7 +16,6 @@ from lapgs_wgpu.data.images import ImageFile
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.masks import MaskKind
 from lapgs_wgpu.data.normalize import Normalization
-from lapgs_wgpu.data.poses import place_of
 from lapgs_wgpu.data.stamps import ImageName
 
 Split = Literal["train", "val", "test"]
@@ -40,11 +39,6 @@ class Frame:
     moving: Path | None = None  # the same of what moves, white
     states_size: bool = True  # whether the files state size or center of the lens; else they are those of the image
 
-    @property
-    def place(self) -> NDArray[np.float64]:
-        """(3,) the place of the camera."""
-        return place_of(self.T_cam_world)
-
 
 @dataclass(frozen=True, eq=False)
 class Capture:
@@ -66,14 +60,11 @@ class Capture:
 
 
 class Reader(NamedTuple):
-    """A capture format.
-
-    name: of the format. files: what identifies it, for errors. matches: whether a folder holds it. read: reads a
-    folder; the second argument is the wanted longer side in pixels, for formats that store images of several sizes, or
-    None. Raises InputError.
-    """
+    """A capture format."""
 
     name: str
-    files: str
-    matches: Callable[[Path], bool]
+    files: str  # what identifies it, for errors
+    matches: Callable[[Path], bool]  # whether a folder holds it
+    # Reads a folder. The second argument is the wanted longer side in pixels, for formats that store images of several
+    # sizes, or None. Raises InputError.
     read: Callable[[Path, int | None], Capture]

@@ -38,10 +38,6 @@ class Fields:
         """Return a number within bounds. Raises InputError."""
         return number(self.required(name), name, self.where, least, most)
 
-    def time(self, name: str) -> float:
-        """Return a finite number, a time in any unit. Raises InputError."""
-        return number(self.required(name), name, self.where)
-
     def side(self, name: str) -> int:
         """Return a side of an image in pixels. Raises InputError."""
         return round(self.number(name, 1, LARGEST_SIDE))
@@ -92,10 +88,7 @@ def read_json(path: Path) -> Fields:
 def number(
     value: Any, name: str, where: str | Path, least: float = -sys.float_info.max, most: float = sys.float_info.max
 ) -> float:
-    """Convert a JSON number, or a text that states one, within bounds to a float; NaN and infinity never are.
-
-    Raises InputError.
-    """
+    """Convert a JSON number, or a text that states one, to a finite float within bounds. Raises InputError."""
     try:
         if isinstance(value, bool) or not isinstance(value, int | float | str):
             raise ValueError

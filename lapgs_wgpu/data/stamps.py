@@ -132,10 +132,8 @@ def extent(places: Sequence[NDArray[np.float64]]) -> float:
 
 
 def stand_still(names: Iterable[ImageName], places: Mapping[str, NDArray[np.float64]]) -> bool:
-    """Whether there are several cameras, each at one place, as exactly as structure from motion finds it.
-
-    places: (3,) of the cameras of some of the files.
-    """
+    """Whether there are several cameras, each at one place, as exactly as structure from motion finds it. places: (3,)
+    of the cameras of some of the files."""
     placed = [name for name in names if name.file in places]
     cameras = [[places[placed[i].file] for i in mine] for mine in by_camera(placed).values()]
     if len(cameras) < 2:

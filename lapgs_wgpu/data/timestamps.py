@@ -23,11 +23,8 @@ IN_STEP = 0.1  # of the time from an image of a camera to its next: less than fi
 
 
 def read_times(names: Sequence[ImageName], folder: Path) -> tuple[list[float], str]:
-    """Read the time of each image, in any unit, and name the source of the times for errors.
-
-    The source is times.json in the folder, if it exists, else clock times, seconds or frame numbers in the names.
-    Raises InputError.
-    """
+    """Read the time of each image, in any unit, and name their source for errors: times.json in the folder, if it
+    exists, else clock times, seconds or frame numbers in the names. Raises InputError."""
     path = folder / TIMES
     if not path.is_file():
         clocks = clock_times(names)
@@ -75,9 +72,7 @@ def as_one_camera(
     names: Sequence[ImageName], times: Sequence[float], places: Sequence[NDArray[np.float64]]
 ) -> list[ImageName]:
     """Give the images of several folders to one camera if it moves in each, and they follow one another in time.
-
-    places: (3,) of the camera of each image.
-    """
+    places: (3,) of the camera of each image."""
     groups = list(by_camera(names).values())
     spans = sorted((min(times[i] for i in mine), max(times[i] for i in mine)) for mine in groups)
     follow = all(after[0] > before[1] for before, after in pairwise(spans))
@@ -88,10 +83,8 @@ def as_one_camera(
 
 
 def frame_numbers(names: Sequence[ImageName]) -> list[int]:
-    """Return the frame number in each file name: the only number that differs between the images of a camera.
-
-    Raises InputError if no number differs, or more than one.
-    """
+    """Return the frame number in each file name: the only number that differs between the images of a camera. Raises
+    InputError if there is none, or more than one."""
     found = [0] * len(names)
     for mine in by_camera(names).values():
         files = [names[i].file for i in mine]
@@ -159,11 +152,8 @@ def disorder(names: Sequence[ImageName], times: Sequence[float]) -> list[str]:
 
 
 def held_out(names: Sequence[ImageName], times: Sequence[float]) -> set[int]:
-    """Return the indices of the test images.
-
-    These are the images of the first camera, if there are three or more cameras; else those of every eighth time, from
-    the fifth on. Raises InputError if there are too few.
-    """
+    """Return the indices of the test images: those of the first camera, if there are three or more cameras; else those
+    of every eighth time, from the fifth on. Raises InputError if there are too few."""
     cameras = sorted({name.camera for name in names}, key=natural_key)
     if len(cameras) >= CAMERAS:
         return {i for i, name in enumerate(names) if name.camera == cameras[0]}

@@ -32,10 +32,7 @@ INTERLACED = (
 
 def unpacked(path: Path, image_size: int | None) -> list[ImageFile]:
     """Return the frames of a film, upright and with their longer side at most `image_size`; unpack them the first time.
-
-    Frames that an edit list cuts off are none. Raises InputError, also if PyAV is missing, for frames that are too
-    large, and for pixels that are not square.
-    """
+    Frames that an edit list cuts off are none. Raises InputError, also if PyAV is missing."""
     with opened_film(path) as (file, stream):
         if abs(pixel_aspect(stream) - 1) > 0.01:
             raise InputError(
@@ -120,10 +117,8 @@ def opened_film(path: Path) -> Iterator[tuple[Any, Any]]:
 
 
 class Display(NamedTuple):
-    """How the pixels of a film are shown: mirrored (left and right exchanged) first, then turned.
-
-    turns: by 90 degrees counterclockwise, 0 to 3.
-    """
+    """How the pixels of a film are shown: mirrored (left and right exchanged) first, then turned so many times by 90
+    degrees counterclockwise, 0 to 3."""
 
     turns: int
     mirrored: bool

@@ -11,7 +11,7 @@ import numpy as np
 from lapgs_wgpu.data.capture_files import CaptureFiles
 from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import SUFFIXES, check_image
-from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, Fields, read_json
+from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, Fields, number, read_json
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.poses import OPENGL_TO_OPENCV, opengl_pose, rotation_of, world_to_camera
 from lapgs_wgpu.data.stamps import ImageName, natural_key
@@ -36,24 +36,25 @@ def _read_record3d(folder: Path, image_size: int | None) -> Capture:
         raise InputError(f"{path} has {count} poses, but there is {files[max(files)]}; export them again.")
     optional = [name for name in ("frameTimestamps", "perFrameIntrinsicCoeffs") if data.values.get(name)]
     entries = data.table("frame", "poses", *optional)
-    size, timed, frames = (data.side("w"), data.side("h")), "frameTimestamps" in optional, []
+    timed = "frameTimestamps" if "frameTimestamps" in optional else "fps"
+    size, frames = (data.side("w"), data.side("h")), []
     for index, file in sorted(files.items()):
-        entry = entries[index]
+        entry, where = entries[index], entries[index].where
         if "perFrameIntrinsicCoeffs" in entry:
             K = entry.matrix("perFrameIntrinsicCoeffs", 4)
         else:
             K = data.matrix("K", 9)[[0, 4, 6, 7]]  # which is stored column by column
         x, y, z, w, *position = entry.matrix("poses", 7)
-        R_world_cam = rotation_of(np.array([w, x, y, z]), entry.where) @ OPENGL_TO_OPENCV
+        R_world_cam = rotation_of(np.array([w, x, y, z]), where) @ OPENGL_TO_OPENCV
         pose, name = world_to_camera(R_world_cam, np.array(position)), ImageName(f"{images.name}/{file.name}")
-        time = entry.time("frameTimestamps") if timed else index / data.number("fps", 1e-9, 1e5)
-        frames.append(Frame(check_image(file), Lens(*size, *K.tolist()), pose, entry.where, name, time))
+        time = number(entry.values[timed], timed, where) if timed in entry else index / data.number("fps", 1e-9, 1e5)
+        frames.append(Frame(check_image(file), Lens(*size, *K.tolist()), pose, where, name, time))
     absent = count - len(files)
     warnings = [f"{images} holds {len(files)} images for {count} poses; the other poses are left out."]
     return Capture(
         frames,
         source=path,
-        time_source=f"{'frameTimestamps' if timed else 'fps'} in {path}",
+        time_source=f"{timed} in {path}",
         warnings=warnings if absent else [],
         left_out=absent,
         own_footage=True,
@@ -83,7 +84,8 @@ def _read_polycam(folder: Path, image_size: int | None) -> Capture:
         fx, fy, cx, cy = (data.number(k, -LARGEST_INTRINSIC, LARGEST_INTRINSIC) for k in ("fx", "fy", "cx", "cy"))
         lens = Lens(data.side("width"), data.side("height"), fx, fy, cx, cy)
         rows = [[data.required(f"t_{i}{j}") for j in range(4)] for i in range(3)]
-        pose, time = opengl_pose(Fields({"transform_matrix": rows}, str(path))), data.number("timestamp", -1e18, 1e18)
+        pose = opengl_pose(Fields({"transform_matrix": rows}, str(path)))
+        time = data.number("timestamp", -1e18, 1e18)
         frames.append(Frame(check_image(images / name), lens, pose, str(path), ImageName(name), time))
     warnings = files.left_out(len(described), cameras)
     count = sum(file.suffix.lower() in SUFFIXES for file in listed(images))

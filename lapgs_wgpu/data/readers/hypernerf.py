@@ -33,7 +33,10 @@ def _read(folder: Path, image_size: int | None) -> Capture:
     depths = scene.number("near", TINY), scene.number("far", TINY)
     if depths[0] >= depths[1]:
         raise InputError(f"{scene.where}: near must be below far, got {depths[0]:g} and {depths[1]:g}.")
-    times = _times(read_json(folder / "metadata.json"), ids)
+    metadata = read_json(folder / "metadata.json")
+    stated = {name: as_fields(metadata.required(name), f"{metadata.where}: {name}") for name in ids}
+    field = "time_id" if any("time_id" in entry for entry in stated.values()) else "warp_id"
+    times = {name: int(entry.number(field, 0)) for name, entry in stated.items()}
     named = [name for names in splits.values() for name in names]
     rgb = _image_folder(folder / "rgb", named, image_size)
     files, frames = CaptureFiles(rgb), []
@@ -73,16 +76,8 @@ def _splits(data: Fields) -> tuple[list[str], dict[Split, list[str]]]:
             "may be trained on: remove them from one of the two."
         )
     if unknown := {*train, *test} - {*ids}:
-        raise InputError(
-            f"{data.where}: train_ids or val_ids name {min(unknown)}, none of its {len(ids)} ids; add it there."
-        )
+        raise InputError(f"{data.where}: train_ids or val_ids name {min(unknown)}, none of its {len(ids)} ids; add it.")
     return ids, {"train": train, "test": test}
-
-
-def _times(metadata: Fields, ids: Sequence[str]) -> dict[str, int]:
-    entries = {name: as_fields(metadata.required(name), f"{metadata.where}: {name}") for name in ids}
-    field = "time_id" if any("time_id" in entry for entry in entries.values()) else "warp_id"
-    return {name: int(entry.number(field, 0)) for name, entry in entries.items()}
 
 
 def _read_camera(stated: Fields) -> tuple[Lens, np.ndarray]:

@@ -120,9 +120,7 @@ def _read_neu3d(folder: Path, image_size: int | None) -> Capture:
 
 def _recordings(folder: Path, image_size: int | None) -> dict[Path, list[ImageFile]]:
     """Return the frames of each camera, by its number: its images if all cameras have them, else those of its film."""
-    children = sorted(
-        (c for c in folder.iterdir() if CAMERA.fullmatch(c.stem)), key=lambda child: natural_key(child.stem)
-    )
+    children = sorted((c for c in folder.iterdir() if CAMERA.fullmatch(c.stem)), key=lambda c: natural_key(c.stem))
     films = [child for child in children if child.suffix.lower() == ".mp4"]
     folders = [child for child in children if (child / IMAGES).is_dir()]
     cameras = {child.stem for child in (*films, *folders)}
@@ -174,9 +172,7 @@ def _depth_cloud(folder: Path, frames: list[Frame]) -> Cloud:
     """Make points at the depths of some of the maps, in their images' colors. Raises InputError."""
     maps = [image.path for image in _images(folder / DEPTH)]
     if len(maps) != len(frames):
-        raise InputError(
-            f"{folder / DEPTH} holds {len(maps)} maps for {len(frames)} images; add the rest, or remove it."
-        )
+        raise InputError(f"{folder / DEPTH} has {len(maps)} maps for {len(frames)} images; add the rest, or remove it.")
     chosen = evenly(list(zip(frames, maps, strict=True)), MAPS)
     random, points, colors = np.random.default_rng(0), [], []
     for frame, path in chosen:
@@ -198,17 +194,9 @@ def _depth_cloud(folder: Path, frames: list[Frame]) -> Cloud:
     return Cloud(np.concatenate(points).astype(np.float32), np.concatenate(colors).astype(np.float32))
 
 
+FILMS = f"{POSES} beside cam00.mp4, ... or cam00/images/, ..."
+ALONE = f"{POSES} beside images/"
 READERS = (
-    Reader(
-        "Neu3D",
-        "poses_bounds.npy beside cam00.mp4, ... or cam00/images/, ...",
-        lambda folder: (folder / POSES).is_file() and not (folder / IMAGES).is_dir(),
-        _read_neu3d,
-    ),
-    Reader(
-        "EndoNeRF",
-        "poses_bounds.npy beside images/",
-        lambda folder: (folder / POSES).is_file() and (folder / IMAGES).is_dir(),
-        _read_endonerf,
-    ),
+    Reader("Neu3D", FILMS, lambda f: (f / POSES).is_file() and not (f / IMAGES).is_dir(), _read_neu3d),
+    Reader("EndoNeRF", ALONE, lambda f: (f / POSES).is_file() and (f / IMAGES).is_dir(), _read_endonerf),
 )

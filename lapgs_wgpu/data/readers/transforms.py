@@ -13,14 +13,15 @@ from lapgs_wgpu.data.capture_files import CaptureFiles
 from lapgs_wgpu.data.cloud import find_cloud, is_random, read_cloud
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import SIDEWAYS, ImageFile
-from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, LARGEST_SIDE, Fields, read_json
+from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, LARGEST_SIDE, Fields, number, read_json
 from lapgs_wgpu.data.lens import Lens
-from lapgs_wgpu.data.poses import opengl_pose
+from lapgs_wgpu.data.poses import opengl_pose, place_of
 from lapgs_wgpu.data.stamps import ImageName, image_names
 from lapgs_wgpu.data.validation import check_frames
 from lapgs_wgpu.errors import InputError, shown
 from lapgs_wgpu.splat.camera import intrinsics_of_fov
 
+TRAIN, TEST = "transforms_train.json", "transforms_test.json"  # D-NeRF's
 CLOUDS = ("fused.ply", "points3d.ply", "points3D.ply")
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 SIDE, FOCAL, ANY = (1, LARGEST_SIDE), (1e-9, LARGEST_INTRINSIC), (-LARGEST_INTRINSIC, LARGEST_INTRINSIC)
@@ -31,10 +32,8 @@ INTRINSICS = {  # bounds, in pixels of an image w x h
 
 
 def _read_frames(data: Fields, files: CaptureFiles, time: str) -> dict[int, Frame]:
-    """Return the frames of a transforms file whose images exist, by the places of their entries.
-
-    time: the field of the times, in all entries or in none. Raises InputError.
-    """
+    """Return the frames of a transforms file whose images exist, by the places of their entries. time: the field of the
+    times, in all entries or in none. Raises InputError."""
     entries = data.objects("frames", "frame")
     timed = sum(_states(entry, time) for entry in entries)
     frames = {}
@@ -43,7 +42,8 @@ def _read_frames(data: Fields, files: CaptureFiles, time: str) -> dict[int, Fram
             raise InputError(
                 f"{entry.where} has no field {time}, though {timed} of {len(entries)} frames have it; give it for all."
             )
-        stated, pose = entry.time(time) if timed else None, opengl_pose(entry)
+        stated = number(entry.values[time], time, entry.where) if timed else None
+        pose = opengl_pose(entry)
         if found := files.image(entry, "file_path"):
             name, image = found
             lens, sized = read_lens(entry, data, image)
@@ -56,11 +56,9 @@ def _states(entry: Fields, field: str) -> bool:
 
 
 def read_lens(frame: Fields, shared: Fields, image: ImageFile) -> tuple[Lens, bool]:
-    """Return the lens of a frame, and whether size or center are stated; each value is the frame's, else its file's.
-
-    A missing size is the image's; the focal length is that of camera_angle_x (radians) where fl_x is missing. Raises
-    InputError, also for other lens models.
-    """
+    """Return the lens of a frame, and whether size or center are stated; each value is the frame's, else its file's. A
+    missing size is the image's; the focal length is that of camera_angle_x (radians) where fl_x is missing. Raises
+    InputError, also for other lens models."""
 
     def source(name: str) -> Fields:
         return frame if name in frame else shared
@@ -68,9 +66,7 @@ def read_lens(frame: Fields, shared: Fields, image: ImageFile) -> tuple[Lens, bo
     model = source("camera_model").values.get("camera_model", "OPENCV")
     if model not in MODELS or source("is_fisheye").values.get("is_fisheye"):
         named = shown(model) if model not in MODELS else "is_fisheye"
-        raise InputError(
-            f"{frame.where}: camera_model {named} is none that is read ({', '.join(MODELS)}); undistort the images."
-        )
+        raise InputError(f"{frame.where}: camera_model {named} is none of {', '.join(MODELS)}; undistort the images.")
     stated = [name for name in INTRINSICS if _states(source(name), name)]
     values = {name: source(name).number(name, *INTRINSICS[name]) for name in stated}
     centered = {"cx", "cy"} <= values.keys()
@@ -119,7 +115,7 @@ def _read_nerfstudio(folder: Path, image_size: int | None) -> Capture:
                 "train_filenames, val_filenames and test_filenames, and are left out."
             )
         frames = {f: dataclasses.replace(frame, split=splits[f]) for f, frame in frames.items() if f in splits}
-    names = image_names(list(frames), {file: frame.place for file, frame in frames.items()})
+    names = image_names(list(frames), {file: place_of(frame.T_cam_world) for file, frame in frames.items()})
     cloud = files.optional(data, "ply_file_path")
     return Capture(
         [dataclasses.replace(frames[name.file], name=name) for name in names],
@@ -134,12 +130,10 @@ def _read_nerfstudio(folder: Path, image_size: int | None) -> Capture:
 
 
 def _splits(data: Fields, names: list[str], files: CaptureFiles) -> dict[str, Split]:
-    """Return the split of each image, as the file's lists state it; {} if they hold nothing out.
-
-    An image in no list is for training, but missing here if the file lists those for training. Raises InputError for a
-    name that no frame has.
-    """
-    known, stated = set(names), {_path(str(entry["file_path"])) for entry in data.values["frames"]}
+    """Return the split of each image, as the file's lists state it; {} if they hold nothing out. An image in no list is
+    for training, but missing here if the file lists those for training. Raises InputError for other names."""
+    known = set(names)
+    stated = {PurePosixPath(str(entry["file_path"]).replace("\\", "/")) for entry in data.values["frames"]}
     lists: dict[Split, list[str]] = {"train": [], "val": [], "test": []}
     for split, found in lists.items():
         field = f"{split}_filenames"
@@ -149,20 +143,14 @@ def _splits(data: Fields, names: list[str], files: CaptureFiles) -> dict[str, Sp
         for name in listed:
             if (file := files.find(name)) in known:
                 found.append(str(file))
-            elif _path(name) not in stated:
-                raise InputError(
-                    f"{data.where}: {field} names {name[:80]}, none of its {len(names)} frames; remove it."
-                )
+            elif PurePosixPath(name.replace("\\", "/")) not in stated:
+                raise InputError(f"{data.where}: {field} names {name[:80]}, none of {len(names)} frames; remove it.")
     if not lists["test"]:  # one list is enough to measure by
         lists["test"], lists["val"] = lists["val"], []
     if not lists["test"]:
         return {}
     lists["train"] = lists["train"] or names
     return {name: split for split, found in lists.items() for name in found}
-
-
-def _path(name: str) -> PurePosixPath:
-    return PurePosixPath(name.replace("\\", "/"))
 
 
 # D-NeRF
@@ -182,7 +170,7 @@ def _read_dnerf(folder: Path, image_size: int | None) -> Capture:
     cloud = None if path is None else read_cloud(path)
     if cloud is not None and is_random(cloud):  # other trainers write one, often of 1.3 whatever the scene's size
         cloud = None
-    cameras = folder / "transforms_train.json"
+    cameras = folder / TRAIN
     return Capture(
         frames,
         cloud=cloud,
@@ -214,11 +202,6 @@ def _read_split(folder: Path, split: Split, warnings: list[str]) -> list[Frame]:
 
 
 READERS = (
-    Reader(
-        "D-NeRF",
-        "transforms_train.json and transforms_test.json",
-        lambda folder: any((folder / f"transforms_{split}.json").is_file() for split in ("train", "test")),
-        _read_dnerf,
-    ),
-    Reader("nerfstudio", "transforms.json", lambda folder: (folder / "transforms.json").is_file(), _read_nerfstudio),
+    Reader("D-NeRF", f"{TRAIN} and {TEST}", lambda f: (f / TRAIN).is_file() or (f / TEST).is_file(), _read_dnerf),
+    Reader("nerfstudio", "transforms.json", lambda f: (f / "transforms.json").is_file(), _read_nerfstudio),
 )
