@@ -15,7 +15,6 @@ from lapgs_wgpu.data.lens import Lens, Undistortion
 from lapgs_wgpu.data.masks import MOSTLY, Mask, MaskKind, check_masks, find_masks, read_mask
 from lapgs_wgpu.data.normalize import Normalization
 from lapgs_wgpu.data.placement import mover_cube, place
-from lapgs_wgpu.data.poses import place_of
 from lapgs_wgpu.data.readers import apps, colmap, hypernerf, panoptic, poses_bounds, transforms
 from lapgs_wgpu.data.stamps import by_camera, natural_key
 from lapgs_wgpu.data.timestamps import as_one_camera, disorder, held_out, in_step, read_times
@@ -172,7 +171,7 @@ def _timed(folder: Path, capture: Capture, warnings: list[str]) -> tuple[list[Fr
     if not times:
         times, source = read_times(names, folder)
     if capture.own_footage:
-        names = as_one_camera(names, times, [place_of(frame.T_cam_world) for frame in capture.frames])
+        names = as_one_camera(names, times, [frame.place for frame in capture.frames])
         warnings += disorder(names, times)
         times = in_step(names, times)
     first, last = capture.time_range or (min(times), max(times))

@@ -1,5 +1,7 @@
 """Check the poses of capture files and convert them to OpenCV's axes."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -59,13 +61,13 @@ def world_to_camera(R_world_cam: Array, position: Array) -> Array:
     return T_cam_world
 
 
-def opengl_pose(entry: Fields) -> Array:
-    """The (4, 4) pose in OpenCV axes of an entry's transform_matrix: camera to world, OpenGL axes, its last row may be
-    missing. Raises InputError unless it is a rigid motion."""
-    rows, name = entry.required("transform_matrix"), f"{entry.where}: transform_matrix"
-    if isinstance(rows, list) and len(rows) == 3:
-        entry = Fields({"transform_matrix": [*rows, [0, 0, 0, 1]]}, entry.where)
-    T = entry.matrix("transform_matrix", 4, 4)
+def opengl_pose(value: Any, where: str) -> Array:
+    """The (4, 4) pose in OpenCV axes of the field transform_matrix of a transforms file: camera to world, OpenGL axes,
+    its last row may be missing. where: file and frame, for errors. Raises InputError unless it is a rigid motion."""
+    name = f"{where}: transform_matrix"
+    if isinstance(value, list) and len(value) == 3:
+        value = [*value, [0, 0, 0, 1]]
+    T = Fields({"transform_matrix": value}, where).matrix("transform_matrix", 4, 4)
     if np.abs(T[3] - [0, 0, 0, 1]).max() > ROTATION_TOLERANCE:
         got = " ".join(f"{x:g}" for x in T[3])
         raise InputError(f"{name} must end with the row 0 0 0 1, got {got}; the position stands at the right.")

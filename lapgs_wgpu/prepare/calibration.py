@@ -96,7 +96,7 @@ def _nerfstudio(data: Fields) -> dict[str, Calibrated]:
         name = str(entry.required("file_path"))
         width, height = ((entry if side in entry else data).side(side) for side in "wh")
         lens, _ = read_lens(entry, data, ImageFile(Path(name), (width, height)))
-        cameras[name] = Calibrated(lens, opengl_pose(entry), entry.where)
+        cameras[name] = Calibrated(lens, opengl_pose(entry.required("transform_matrix"), entry.where), entry.where)
     return cameras
 
 

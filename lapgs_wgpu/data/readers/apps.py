@@ -11,7 +11,7 @@ import numpy as np
 from lapgs_wgpu.data.capture_files import CaptureFiles
 from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import SUFFIXES, check_image
-from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, Fields, number, read_json
+from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, number, read_json
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.poses import OPENGL_TO_OPENCV, opengl_pose, rotation_of, world_to_camera
 from lapgs_wgpu.data.stamps import ImageName, natural_key
@@ -84,7 +84,7 @@ def _read_polycam(folder: Path, image_size: int | None) -> Capture:
         fx, fy, cx, cy = (data.number(k, -LARGEST_INTRINSIC, LARGEST_INTRINSIC) for k in ("fx", "fy", "cx", "cy"))
         lens = Lens(data.side("width"), data.side("height"), fx, fy, cx, cy)
         rows = [[data.required(f"t_{i}{j}") for j in range(4)] for i in range(3)]
-        pose = opengl_pose(Fields({"transform_matrix": rows}, str(path)))
+        pose = opengl_pose(rows, str(path))
         time = data.number("timestamp", -1e18, 1e18)
         frames.append(Frame(check_image(images / name), lens, pose, str(path), ImageName(name), time))
     warnings = files.left_out(len(described), cameras)

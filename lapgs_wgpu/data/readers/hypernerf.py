@@ -85,9 +85,8 @@ def _read_camera(stated: Fields) -> tuple[Lens, np.ndarray]:
     data = Fields(DEFAULTS | stated.values, stated.where)
     R_cam_world = data.matrix("orientation", 3, 3)
     check_rotation(R_cam_world.T, f"{data.where}: orientation")
-    width, height = (
-        int(number(side, "image_size", data.where, 1, LARGEST_SIDE)) for side in data.entries("image_size", 2)
-    )
+    sides = (number(side, "image_size", data.where, 1, LARGEST_SIDE) for side in data.entries("image_size", 2))
+    width, height = map(int, sides)
     fx = data.number("focal_length", TINY)
     fy = fx * data.number("pixel_aspect_ratio", TINY)
     cx, cy = data.matrix("principal_point", 2).tolist()
