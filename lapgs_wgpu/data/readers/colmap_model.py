@@ -88,7 +88,7 @@ def read_model(folder: Path) -> ColmapModel:
     return ColmapModel(cameras, images, cloud, cameras_file, images_file, points_file)
 
 
-def _camera(where: str, model: str, width: float, height: float, values: Sequence[float | str]) -> Lens:
+def _camera(where: str, model: str, width: float, height: float, values: Sequence[float]) -> Lens:
     if model not in PARAMETERS:
         cut = "cut pinhole views out of the panoramas"
         advice = cut if model == "EQUIRECTANGULAR" else "undistort the images with colmap image_undistorter"
@@ -107,7 +107,7 @@ def _camera(where: str, model: str, width: float, height: float, values: Sequenc
     return Lens(int(width), int(height), fx, fy, p["cx"], p["cy"], radial=radial, tangential=tangential)
 
 
-def _image(name: str, camera: int, values: Sequence[float | str], where: str) -> ColmapImage:
+def _image(name: str, camera: int, values: Sequence[float], where: str) -> ColmapImage:
     """values: a quaternion and a translation. Raises InputError."""
     bounds = -LARGEST_ENTRY, LARGEST_ENTRY
     pose = np.array([number(value, "each number of its pose", where, *bounds) for value in values])
@@ -149,7 +149,7 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
     for where, line in _lines(path):
         words = _words(line, where, "id, model, width, height")
         identity, width, height = _numbers([words[0], *words[2:4]], where, int)
-        yield identity, _camera(where, words[1], width, height, words[4:])
+        yield identity, _camera(where, words[1], width, height, _numbers(words[4:], where))
 
 
 def _text_images(path: Path) -> Iterator[ColmapImage]:
@@ -158,7 +158,7 @@ def _text_images(path: Path) -> Iterator[ColmapImage]:
         if len(line.split()) == 10 or not _NUMBERS.fullmatch(line):
             words = _words(line, where, "id, QW, QX, QY, QZ, TX, TY, TZ, camera, name", most=9)
             (camera,) = _numbers(words[8:9], where, int)
-            yield _image(words[9], camera, words[1:8], f"{where} ({words[9][:80]})")
+            yield _image(words[9], camera, _numbers(words[1:8], where), f"{where} ({words[9][:80]})")
 
 
 def _text_points(path: Path) -> Iterator[Sequence[float]]:
