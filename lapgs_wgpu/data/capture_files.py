@@ -52,10 +52,9 @@ class CaptureFiles:
         if _leads_out(name):
             starts += range(1, len(parts))
         for key in ("/".join(parts[start:]) for start in starts):
-            if found := self._by_name.get(key):
-                return found
             images = _SMALLER.match(key)
-            if images and not os.path.isdir(self.folder / images[0]) and (found := self._smaller.get(_in_images(key))):
+            gone = images is not None and not os.path.isdir(self.folder / images[0])
+            if found := self._by_name.get(key) or (self._smaller.get(_in_images(key)) if gone else None):
                 return found
         return self.find(unquote(name)) if unquote(name) != name else None
 

@@ -77,16 +77,13 @@ def _read_polycam(folder: Path, image_size: int | None) -> Capture:
         raise InputError(f"{cameras} holds no camera (.json); export raw data from Polycam again.")
     frames = []
     for path in described:
-        name = files.find_image(path.stem, f"{path} describes its camera")
-        if name is None:
-            continue
-        data = read_json(path)
-        fx, fy, cx, cy = (data.number(k, -LARGEST_INTRINSIC, LARGEST_INTRINSIC) for k in ("fx", "fy", "cx", "cy"))
-        lens = Lens(data.side("width"), data.side("height"), fx, fy, cx, cy)
-        rows = [[data.required(f"t_{i}{j}") for j in range(4)] for i in range(3)]
-        pose = opengl_pose(rows, str(path))
-        time = data.number("timestamp", -1e18, 1e18)
-        frames.append(Frame(check_image(images / name), lens, pose, str(path), ImageName(name), time))
+        if name := files.find_image(path.stem, f"{path} describes its camera"):
+            data = read_json(path)
+            fx, fy, cx, cy = (data.number(k, -LARGEST_INTRINSIC, LARGEST_INTRINSIC) for k in ("fx", "fy", "cx", "cy"))
+            lens = Lens(data.side("width"), data.side("height"), fx, fy, cx, cy)
+            pose = opengl_pose([[data.required(f"t_{i}{j}") for j in range(4)] for i in range(3)], str(path))
+            time = data.number("timestamp", -1e18, 1e18)
+            frames.append(Frame(check_image(images / name), lens, pose, str(path), ImageName(name), time))
     warnings = files.left_out(len(described), cameras)
     count = sum(file.suffix.lower() in SUFFIXES for file in listed(images))
     undescribed = count - len(frames)
