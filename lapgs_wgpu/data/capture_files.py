@@ -30,10 +30,7 @@ def files_below(folder: Path) -> list[str]:
 
 
 class CaptureFiles:
-    """The files below a folder. `find` says how far names may differ from theirs.
-
-    absent: a sentence about each named image that does not exist.
-    """
+    """The files below a folder. absent: a sentence about each named image that does not exist."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -55,10 +52,9 @@ class CaptureFiles:
         if _leads_out(name):
             starts += range(1, len(parts))
         for key in ("/".join(parts[start:]) for start in starts):
-            if found := self._by_name.get(key):
-                return found
             images = _SMALLER.match(key)
-            if images and not os.path.isdir(self.folder / images[0]) and (found := self._smaller.get(_in_images(key))):
+            gone = images is not None and not os.path.isdir(self.folder / images[0])
+            if found := self._by_name.get(key) or (self._smaller.get(_in_images(key)) if gone else None):
                 return found
         return self.find(unquote(name)) if unquote(name) != name else None
 
@@ -73,10 +69,8 @@ class CaptureFiles:
         return {_in_images(name): path for name, path in self._by_name.items()}
 
     def find_image(self, name: str, named: str) -> str | None:
-        """As `find`, of an image, whose name may lack the suffix. If there is none, a sentence goes to `absent`.
-
-        named: what names it, and as what, for errors. Raises InputError for a file that is no image.
-        """
+        """As `find`, of an image, whose name may lack the suffix. If there is none, a sentence goes to `absent`. named:
+        what names it, and as what, for errors. Raises InputError for a file that is no image."""
         suffixes = ("",) if name.lower().endswith(SUFFIXES) else SUFFIXES
         found = next((found for suffix in suffixes if (found := self.find(name + suffix))), None)
         if found is None:
@@ -101,11 +95,8 @@ class CaptureFiles:
         raise InputError(f"{what}; put it there, or remove that field.")
 
     def left_out(self, count: int, where: Path) -> list[str]:
-        """Return the warning about absent images; none if all exist.
-
-        count: of all images that the file or folder `where` names. Raises InputError if more than MOST_ABSENT are
-        absent.
-        """
+        """Return the warning about absent ones of `count` images that a file or folder names; none if all exist. Raises
+        InputError if more than MOST_ABSENT are absent."""
         if not self.absent:
             return []
         told = f"{len(self.absent)} of {count} images of {where} are absent"

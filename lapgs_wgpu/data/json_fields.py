@@ -15,6 +15,7 @@ from lapgs_wgpu.io import safe_json_toml
 LARGEST_ENTRY = 1e9  # of a pose: matrix products of larger entries lose all digits
 LARGEST_SIDE = 1e5  # of an image, pixels
 LARGEST_INTRINSIC = 1e6  # pixels
+TINY = 1e-12  # smaller values count as 0
 
 
 @dataclass(frozen=True)
@@ -41,9 +42,16 @@ class Fields:
         """Return a side of an image in pixels. Raises InputError."""
         return round(self.number(name, 1, LARGEST_SIDE))
 
-    def vector(self, name: str, length: int) -> NDArray[np.float64]:
-        """Return (length,) numbers of at most LARGEST_ENTRY. Raises InputError."""
-        return matrix(self.required(name), (length,), name, self.where)
+    def matrix(self, name: str, *shape: int) -> NDArray[np.float64]:
+        """Return a list, or lists in lists, as numbers of this shape, of at most LARGEST_ENTRY. Raises InputError."""
+        entries = [self.required(name)]
+        for i, length in enumerate(shape):
+            if bad := [row for row in entries if not isinstance(row, list) or len(row) != length]:
+                needed = " rows of ".join(map(str, shape[i:]))
+                raise InputError(f"{self.where}: {name} must be {needed} numbers, got {shown(bad[0])}.")
+            entries = [entry for row in entries for entry in row]
+        each, bounds = f"each entry of {name}", (-LARGEST_ENTRY, LARGEST_ENTRY)
+        return np.array([number(entry, each, self.where, *bounds) for entry in entries]).reshape(shape)
 
     def entries(self, name: str, count: int | None = None) -> list[Any]:
         """Return a list of at least one entry, or of `count`. Raises InputError."""
@@ -56,6 +64,13 @@ class Fields:
     def objects(self, name: str, what: str) -> "list[Fields]":
         """Return a list of objects. what: an entry, for errors. Raises InputError."""
         return [as_fields(value, f"{self.where}, {what} {i}") for i, value in enumerate(self.entries(name))]
+
+    def table(self, what: str, *names: str) -> "list[Fields]":
+        """Return the rows of a table that is stored as columns, lists of equal length. what: a row, for errors."""
+        first = self.entries(names[0])
+        columns = [first, *(self.entries(name, len(first)) for name in names[1:])]
+        rows = zip(*columns, strict=True)
+        return [Fields(dict(zip(names, row, strict=True)), f"{self.where}, {what} {i}") for i, row in enumerate(rows)]
 
 
 def as_fields(value: Any, where: str) -> Fields:
@@ -73,10 +88,7 @@ def read_json(path: Path) -> Fields:
 def number(
     value: Any, name: str, where: str | Path, least: float = -sys.float_info.max, most: float = sys.float_info.max
 ) -> float:
-    """Convert a JSON number, or a text that states one, within bounds to a float; NaN and infinity never are.
-
-    Raises InputError.
-    """
+    """Convert a JSON number, or a text that states one, to a finite float within bounds. Raises InputError."""
     try:
         if isinstance(value, bool) or not isinstance(value, int | float | str):
             raise ValueError
@@ -88,14 +100,3 @@ def number(
     if not least <= converted <= most:  # true for NaN, too
         raise InputError(f"{where}: {name} must be a finite number from {least:g} to {most:g}, got {converted:g}.")
     return converted
-
-
-def matrix(value: Any, shape: tuple[int, ...], name: str, where: str | Path) -> NDArray[np.float64]:
-    """Convert a JSON list, or lists in lists, to numbers of this shape, of at most LARGEST_ENTRY. Raises InputError."""
-    if not isinstance(value, list) or len(value) != shape[0]:
-        needed = " rows of ".join(map(str, shape))
-        raise InputError(f"{where}: {name} must be {needed} numbers, got {shown(value)}.")
-    if len(shape) > 1:
-        return np.stack([matrix(row, shape[1:], name, where) for row in value])
-    bounds = -LARGEST_ENTRY, LARGEST_ENTRY
-    return np.array([number(entry, f"each entry of {name}", where, *bounds) for entry in value])

@@ -16,8 +16,8 @@ from lapgs_wgpu.data.masks import MOSTLY, check_masks, find_masks, read_mask
 from lapgs_wgpu.data.normalize import Normalization
 from lapgs_wgpu.data.placement import mover_cube, place
 from lapgs_wgpu.data.readers import apps, colmap, hypernerf, panoptic, poses_bounds, transforms
-from lapgs_wgpu.data.stamps import natural_key
-from lapgs_wgpu.data.timestamps import as_one_camera, by_camera, disorder, held_out, in_step, read_times
+from lapgs_wgpu.data.stamps import by_camera, natural_key
+from lapgs_wgpu.data.timestamps import as_one_camera, disorder, held_out, in_step, read_times
 from lapgs_wgpu.data.validation import check_cloud, check_frames, check_plausible, check_views, upright
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError

@@ -5,8 +5,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.json_fields import matrix
+from lapgs_wgpu.data.json_fields import Fields
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.splat.camera import rotation_matrix
 
 Array = NDArray[np.float64]
 
@@ -32,12 +33,12 @@ def check_rotation(R: Array, name: str) -> None:
         raise InputError(f"{name} is left-handed (determinant -1): its axes are not the format's; export it again.")
 
 
-def unit_quaternion(quaternion: Array, where: str) -> Array:
-    """Return a quaternion (4,) of length 1. Raises InputError where it is far from that."""
+def rotation_of(quaternion: Array, where: str) -> Array:
+    """(3, 3) the rotation of a quaternion (4,), wxyz. Raises InputError where its length is far from 1."""
     length = float(np.linalg.norm(quaternion))
     if abs(length - 1) > UNIT:
         raise InputError(f"{where}: its quaternion has length {length:g}, must be 1; export the poses again.")
-    return quaternion / length
+    return rotation_matrix(quaternion / length)
 
 
 def place_of(T_cam_world: Array) -> Array:
@@ -61,18 +62,14 @@ def world_to_camera(R_world_cam: Array, position: Array) -> Array:
 
 
 def opengl_pose(value: Any, where: str) -> Array:
-    """Convert a camera-to-world matrix in OpenGL axes to a (4, 4) pose in OpenCV axes.
-
-    value: the field transform_matrix of a transforms file. where: file and frame, for errors. Raises InputError unless
-    the matrix is a rigid motion.
-    """
+    """The (4, 4) pose in OpenCV axes of the field transform_matrix of a transforms file: camera to world, OpenGL axes,
+    its last row may be missing. where: file and frame, for errors. Raises InputError unless it is a rigid motion."""
     name = f"{where}: transform_matrix"
     if isinstance(value, list) and len(value) == 3:
         value = [*value, [0, 0, 0, 1]]
-    T = matrix(value, (4, 4), "transform_matrix", where)
+    T = Fields({"transform_matrix": value}, where).matrix("transform_matrix", 4, 4)
     if np.abs(T[3] - [0, 0, 0, 1]).max() > ROTATION_TOLERANCE:
         got = " ".join(f"{x:g}" for x in T[3])
         raise InputError(f"{name} must end with the row 0 0 0 1, got {got}; the position stands at the right.")
-    R, position = T[:3, :3], T[:3, 3]
-    check_rotation(R, name)
-    return world_to_camera(R @ OPENGL_TO_OPENCV, position)
+    check_rotation(T[:3, :3], name)
+    return world_to_camera(T[:3, :3] @ OPENGL_TO_OPENCV, T[:3, 3])

@@ -86,7 +86,7 @@ def _named_by_both(files: Sequence[str], places: Mapping[str, NDArray[np.float64
     still, and most have an image at each time; else None."""
     rows = [re.findall(r"\d+|[^\W\d_]+", PurePosixPath(file).stem) for file in files]
     varying = [at for at, words in enumerate(zip(*rows)) if len(set(words)) > 1]  # noqa: B905
-    apart = len(places) > 1 and np.ptp(list(places.values()), axis=0).max() > 0
+    apart = len(places) > 1 and extent(list(places.values())) > 0
     if len(set(map(len, rows))) > 1 or len(varying) != 2 or not apart:
         return None
     for camera, time in (varying, varying[::-1]):
@@ -118,19 +118,28 @@ def _word(name: str) -> str:
     return re.sub(r"[\W\d_]", "", re.sub(r"\d+\D*$", "", name)).lower()
 
 
-def stand_still(names: Iterable[ImageName], places: Mapping[str, NDArray[np.float64]]) -> bool:
-    """Whether there are several cameras, each at one place, as exactly as structure from motion finds it.
+def by_camera(names: Sequence[ImageName]) -> dict[str, list[int]]:
+    """Return the indices of the images of each camera, by its name, in natural order."""
+    groups: dict[str, list[int]] = {}
+    for index, name in enumerate(names):
+        groups.setdefault(name.camera, []).append(index)
+    return {camera: groups[camera] for camera in sorted(groups, key=natural_key)}
 
-    places: (3,) of the cameras of some of the files.
-    """
-    cameras: dict[str, list[NDArray[np.float64]]] = {}
-    for name in names:
-        if name.file in places:
-            cameras.setdefault(name.camera, []).append(places[name.file])
+
+def extent(places: Sequence[NDArray[np.float64]]) -> float:
+    """The largest side of the box around places (3,)."""
+    return float(np.ptp(places, axis=0).max())
+
+
+def stand_still(names: Iterable[ImageName], places: Mapping[str, NDArray[np.float64]]) -> bool:
+    """Whether there are several cameras, each at one place, as exactly as structure from motion finds it. places: (3,)
+    of the cameras of some of the files."""
+    placed = [name for name in names if name.file in places]
+    cameras = [[places[placed[i].file] for i in mine] for mine in by_camera(placed).values()]
     if len(cameras) < 2:
         return False
-    apart = float(np.ptp(np.concatenate(list(cameras.values())), axis=0).max())
-    return all(float(np.ptp(own, axis=0).max()) <= STILL * apart for own in cameras.values())
+    apart = extent([place for own in cameras for place in own])
+    return all(extent(own) <= STILL * apart for own in cameras)
 
 
 # Times
@@ -161,12 +170,11 @@ def _seconds(found: re.Match[str]) -> float | None:
     if found["half"]:
         hour = hour % 12 + 12 * (found["half"] in "Pp")
     try:
-        midnight = datetime.strptime(re.sub(r"\D", "", found["date"] or "19700101"), "%Y%m%d").replace(tzinfo=UTC)
-    except ValueError:  # 20261399_000001
+        date = datetime.strptime(re.sub(r"\D", "", found["date"] or "19700101"), "%Y%m%d")
+        clock = date.replace(hour=hour, minute=minute, second=second, tzinfo=UTC)
+    except ValueError:  # 20261399_000001, 250000
         return None
-    possible = hour < 24 and minute < 60 and second < 60
-    clock = 3600 * hour + 60 * minute + second + float(f"0.{found['part'] or 0}")
-    return midnight.timestamp() + clock if possible else None
+    return clock.timestamp() + float(f"0.{found['part'] or 0}")
 
 
 def _times_of_day(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.data.evenly import some
 from lapgs_wgpu.data.json_fields import number, read_json
-from lapgs_wgpu.data.stamps import STILL, ImageName, clock_times, natural_key
+from lapgs_wgpu.data.stamps import STILL, ImageName, by_camera, clock_times, extent, natural_key
 from lapgs_wgpu.errors import InputError
 
 TIMES = "times.json"
@@ -23,17 +23,23 @@ IN_STEP = 0.1  # of the time from an image of a camera to its next: less than fi
 
 
 def read_times(names: Sequence[ImageName], folder: Path) -> tuple[list[float], str]:
-    """Read the time of each image, in any unit, and name the source of the times for errors.
-
-    The source is times.json in the folder, if it exists, else clock times, seconds or frame numbers in the names.
-    Raises InputError.
-    """
+    """Read the time of each image, in any unit, and name their source for errors: times.json in the folder, if it
+    exists, else clock times, seconds or frame numbers in the names. Raises InputError."""
     path = folder / TIMES
-    if path.is_file():
-        return _listed(names, path), str(path)
-    clocks = clock_times(names)
-    times, kind = clocks or ([float(number) for number in frame_numbers(names)], "frame numbers")
-    return times, f"the {kind} in the names of {folder}"
+    if not path.is_file():
+        clocks = clock_times(names)
+        times, kind = clocks or ([float(number) for number in frame_numbers(names)], "frame numbers")
+        return times, f"the {kind} in the names of {folder}"
+    stated = read_json(path).values
+    listed = [file if (file := name.file) in stated else file.removeprefix("images/") for name in names]
+    missing = [file for file in listed if file not in stated]
+    if missing:
+        example = f", such as {next(iter(stated))[:80]}" if stated else ""
+        raise InputError(
+            f"{path} has {len(stated)} times{example}, but none for {len(missing)} of {len(names)} images, such "
+            f"as {missing[0]}; name each image by its path below images/."
+        )
+    return [number(stated[file], f"the time of {file}", path) for file in listed], str(path)
 
 
 def time_step(times: NDArray[np.float64]) -> float:
@@ -62,48 +68,23 @@ def in_step(names: Sequence[ImageName], values: Sequence[float]) -> list[float]:
     return times.tolist()
 
 
-def by_camera(names: Sequence[ImageName]) -> dict[str, list[int]]:
-    """Return the indices of the images of each camera, by its name, in natural order."""
-    groups: dict[str, list[int]] = {}
-    for index, name in enumerate(names):
-        groups.setdefault(name.camera, []).append(index)
-    return {camera: groups[camera] for camera in sorted(groups, key=natural_key)}
-
-
 def as_one_camera(
     names: Sequence[ImageName], times: Sequence[float], places: Sequence[NDArray[np.float64]]
 ) -> list[ImageName]:
     """Give the images of several folders to one camera if it moves in each, and they follow one another in time.
-
-    places: (3,) of the camera of each image.
-    """
+    places: (3,) of the camera of each image."""
     groups = list(by_camera(names).values())
     spans = sorted((min(times[i] for i in mine), max(times[i] for i in mine)) for mine in groups)
     follow = all(after[0] > before[1] for before, after in pairwise(spans))
-    least = STILL * float(np.ptp(places, axis=0).max())
-    moving = all(float(np.ptp([places[i] for i in mine], axis=0).max()) > least for mine in groups)
+    least = STILL * extent(places)
+    moving = all(extent([places[i] for i in mine]) > least for mine in groups)
     one = len(groups) > 1 and follow and moving
     return [name._replace(camera="") for name in names] if one else list(names)
 
 
-def _listed(names: Sequence[ImageName], path: Path) -> list[float]:
-    times = read_json(path).values
-    listed = [file if (file := name.file) in times else file.removeprefix("images/") for name in names]
-    missing = [file for file in listed if file not in times]
-    if missing:
-        example = f", such as {next(iter(times))[:80]}" if times else ""
-        raise InputError(
-            f"{path} has {len(times)} times{example}, but none for {len(missing)} of {len(names)} images, such "
-            f"as {missing[0]}; name each image by its path below images/."
-        )
-    return [number(times[file], f"the time of {file}", path) for file in listed]
-
-
 def frame_numbers(names: Sequence[ImageName]) -> list[int]:
-    """Return the frame number in each file name: the only number that differs between the images of a camera.
-
-    Raises InputError if no number differs, or more than one.
-    """
+    """Return the frame number in each file name: the only number that differs between the images of a camera. Raises
+    InputError if there is none, or more than one."""
     found = [0] * len(names)
     for mine in by_camera(names).values():
         files = [names[i].file for i in mine]
@@ -115,25 +96,24 @@ def frame_numbers(names: Sequence[ImageName]) -> list[int]:
                 f"{one} has {fewest} numbers in its name and {other} has {most}, so which is the frame's is "
                 f"not clear; write the times into {TIMES}, or number the frames."
             )
-        varying = [column for column in range(len(rows[0])) if len({row[column] for row in rows}) > 1]
+        columns = list(zip(*rows, strict=True))
+        varying = [column for column in columns if len(set(column)) > 1]
         if len(varying) > 1:  # a counter beside a clock of seconds, which repeats itself
-            ordered = sorted(rows, key=lambda row: [row[column] for column in reversed(varying)])
-            once = [column for column in varying if len({row[column] for row in rows}) == len(rows)]
-            if len(once) == 1 and all(a[c] <= b[c] for a, b in pairwise(ordered) for c in varying):
+            once = [column for column in varying if len(set(column)) == len(column)]
+            if len(once) == 1 and all(x <= y for a, b in pairwise(sorted(rows)) for x, y in zip(a, b, strict=True)):
                 varying = once
         if len(varying) > 1:
             raise InputError(
                 f"{files[0]} and {files[-1]} differ in {len(varying)} numbers, so the frame number is ambiguous; write "
                 f"the times into {TIMES}, or put the images of each camera into a folder of their own."
             )
-        column = varying[0] if varying else len(rows[0]) - 1
         first: dict[int, str] = {}
-        for i, file, row in zip(mine, files, rows, strict=True):
-            found[i] = row[column]
-            if (before := first.setdefault(row[column], file)) != file:
+        for i, file, frame in zip(mine, files, varying[0] if varying else columns[-1], strict=True):
+            found[i] = frame
+            if (before := first.setdefault(frame, file)) != file:
                 raise InputError(
-                    f"{file} has the frame number {row[column]}, as {before} has; rename one, or put the images of "
-                    "each camera into a folder of their own."
+                    f"{file} has the frame number {frame}, as {before} has; rename one, or put the images of each "
+                    "camera into a folder of their own."
                 )
     return found
 
@@ -172,11 +152,8 @@ def disorder(names: Sequence[ImageName], times: Sequence[float]) -> list[str]:
 
 
 def held_out(names: Sequence[ImageName], times: Sequence[float]) -> set[int]:
-    """Return the indices of the test images.
-
-    These are the images of the first camera, if there are three or more cameras; else those of every eighth time, from
-    the fifth on. Raises InputError if there are too few.
-    """
+    """Return the indices of the test images: those of the first camera, if there are three or more cameras; else those
+    of every eighth time, from the fifth on. Raises InputError if there are too few."""
     cameras = sorted({name.camera for name in names}, key=natural_key)
     if len(cameras) >= CAMERAS:
         return {i for i, name in enumerate(names) if name.camera == cameras[0]}

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,31 +32,7 @@ INTERLACED = (
 
 def unpacked(path: Path, image_size: int | None) -> list[ImageFile]:
     """Return the frames of a film, upright and with their longer side at most `image_size`; unpack them the first time.
-
-    Frames that an edit list cuts off are none. Raises InputError, also if PyAV is missing.
-    """
-    shape, size = _check_header(path)
-    wanted = shrunk_size(size, image_size)
-    folder = frames_folder(path, wanted)
-    if not folder.is_dir():
-        _unpack(path, folder, shape, size, wanted)
-    files = sorted(folder.glob("*.png"))
-    return [ImageFile(file, wanted, source=f"{path}, frame {number}") for number, file in enumerate(files)]
-
-
-def frames_folder(path: Path, size: Size) -> Path:
-    """The folder for the frames of this (width, height); size and date of the film are part of its name."""
-    stat, path = path.stat(), path.resolve()
-    caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lapgs_wgpu"
-    name = f"{path.stem}-{size[0]}x{size[1]}-{stat.st_size:x}-{stat.st_mtime_ns:x}"
-    return caches / "frames" / _place(path.parent) / name
-
-
-def _check_header(path: Path) -> "tuple[Display, Size]":
-    """Check the header and decode the first frame: how it is shown, and the (width, height) as shown.
-
-    Raises InputError for what is no film, and for frames that are too large, or not of square pixels.
-    """
+    Frames that an edit list cuts off are none. Raises InputError, also if PyAV is missing."""
     with opened_film(path) as (file, stream):
         if abs(pixel_aspect(stream) - 1) > 0.01:
             raise InputError(
@@ -69,7 +45,21 @@ def _check_header(path: Path) -> "tuple[Display, Size]":
     if first.interlaced_frame:
         print(f"{path}: {INTERLACED}", file=sys.stderr, flush=True)
     shape = display(first)
-    return shape, shape.size((first.width, first.height))
+    size = shape.size((first.width, first.height))
+    wanted = shrunk_size(size, image_size)
+    folder = frames_folder(path, wanted)
+    if not folder.is_dir():
+        _unpack(path, folder, shape, size, wanted)
+    return [ImageFile(file, wanted, source=f"{path}, frame {i}") for i, file in enumerate(sorted(folder.glob("*.png")))]
+
+
+def frames_folder(path: Path, size: Size) -> Path:
+    """The folder for the frames of this (width, height), named by the film, its size and date, and the last two folders
+    that it lies in; neither a drive nor a share is among them, which would lead out of the cache."""
+    stat, path = path.stat(), path.resolve()
+    caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lapgs_wgpu"
+    name = f"{path.stem}-{size[0]}x{size[1]}-{stat.st_size:x}-{stat.st_mtime_ns:x}"
+    return caches / "frames" / "-".join(path.parts[1:-1][-2:]) / name
 
 
 def _unpack(path: Path, folder: Path, shape: "Display", size: Size, wanted: Size) -> None:
@@ -127,10 +117,8 @@ def opened_film(path: Path) -> Iterator[tuple[Any, Any]]:
 
 
 class Display(NamedTuple):
-    """How the pixels of a film are shown: mirrored (left and right exchanged) first, then turned.
-
-    turns: by 90 degrees counterclockwise, 0 to 3.
-    """
+    """How the pixels of a film are shown: mirrored (left and right exchanged) first, then turned so many times by 90
+    degrees counterclockwise, 0 to 3."""
 
     turns: int
     mirrored: bool
@@ -156,11 +144,6 @@ def display(frame: Any) -> Display:
     if mirrored:  # the matrix times that of the mirror, which comes first
         a, b = -a, -b
     return Display(round(float(np.arctan2(-b, a)) / (np.pi / 2)) % 4, mirrored)
-
-
-def _place(folder: PurePath) -> str:
-    """The last two names of a folder; neither a drive nor a share among them, which would lead out of the cache."""
-    return "-".join([part for part in folder.parts if part != folder.anchor][-2:])
 
 
 def pixel_aspect(stream: Any) -> float:

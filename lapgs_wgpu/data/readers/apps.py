@@ -11,61 +11,46 @@ import numpy as np
 from lapgs_wgpu.data.capture_files import CaptureFiles
 from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import SUFFIXES, check_image
-from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, matrix, number, read_json
+from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, number, read_json
 from lapgs_wgpu.data.lens import Lens
-from lapgs_wgpu.data.poses import OPENGL_TO_OPENCV, opengl_pose, unit_quaternion, world_to_camera
+from lapgs_wgpu.data.poses import OPENGL_TO_OPENCV, opengl_pose, rotation_of, world_to_camera
 from lapgs_wgpu.data.stamps import ImageName, natural_key
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.listing import listed
-from lapgs_wgpu.splat.camera import rotation_matrix
 
 
-def _record3d_layout(folder: Path) -> tuple[Path, Path] | None:
-    """Return the file of the metadata and the folder of the images; None if there are none."""
-    for metadata, images in (("metadata.json", "rgb"), ("metadata", "rgbd"), ("metadata.json", "rgbd")):
-        if (folder / metadata).is_file() and any((folder / images / f"0{suffix}").is_file() for suffix in SUFFIXES):
-            return folder / metadata, folder / images
-    return None
+def _record3d_layouts(folder: Path) -> list[tuple[Path, Path]]:
+    """The files of metadata beside a folder of images, and these folders."""
+    names = (("metadata.json", "rgb"), ("metadata", "rgbd"), ("metadata.json", "rgbd"))
+    paths = [(folder / metadata, folder / images) for metadata, images in names if (folder / metadata).is_file()]
+    return [found for found in paths if any((found[1] / f"0{suffix}").is_file() for suffix in SUFFIXES)]
 
 
 def _read_record3d(folder: Path, image_size: int | None) -> Capture:
-    layout = _record3d_layout(folder)
-    assert layout is not None
-    path, images = layout
+    path, images = _record3d_layouts(folder)[0]
     data = read_json(path)
     pictures = [file for file in listed(images) if file.suffix.lower() in SUFFIXES]
     files = {int(file.stem): file for file in pictures if file.stem.isascii() and file.stem.isdigit()}
-    poses = data.entries("poses")
-    if max(files) >= len(poses):
-        raise InputError(f"{path} has {len(poses)} poses, but there is {files[max(files)]}; export them again.")
-    if data.values.get(timed := "frameTimestamps"):
-        times = data.entries(timed, len(poses))
-    else:
-        timed, rate = "fps", data.number("fps", 1e-9, 1e5)
-        times = [index / rate for index in range(len(poses))]
-    if data.values.get("perFrameIntrinsicCoeffs"):
-        intrinsics = data.entries("perFrameIntrinsicCoeffs", len(poses))
-    else:
-        intrinsics = [data.vector("K", 9)[[0, 4, 6, 7]].tolist()] * len(poses)  # K is stored column by column
-    width, height = data.side("w"), data.side("h")
-    frames = []
+    count = len(data.entries("poses"))
+    if max(files) >= count:
+        raise InputError(f"{path} has {count} poses, but there is {files[max(files)]}; export them again.")
+    optional = [name for name in ("frameTimestamps", "perFrameIntrinsicCoeffs") if data.values.get(name)]
+    entries = data.table("frame", "poses", *optional)
+    timed = "frameTimestamps" if "frameTimestamps" in optional else "fps"
+    size, frames = (data.side("w"), data.side("h")), []
     for index, file in sorted(files.items()):
-        where = f"{path}, frame {index}"
-        fx, fy, cx, cy = matrix(intrinsics[index], (4,), "perFrameIntrinsicCoeffs", where).tolist()
-        x, y, z, w, *position = matrix(poses[index], (7,), "poses", where)
-        R_world_cam = rotation_matrix(unit_quaternion(np.array([w, x, y, z]), where))
-        frames.append(
-            Frame(
-                check_image(file),
-                Lens(width, height, fx, fy, cx, cy),
-                world_to_camera(R_world_cam @ OPENGL_TO_OPENCV, np.array(position)),
-                where,
-                ImageName(f"{images.name}/{file.name}"),
-                number(times[index], timed, where),
-            )
-        )
-    absent = len(poses) - len(files)
-    warnings = [f"{images} holds {len(files)} images for {len(poses)} poses; the other poses are left out."]
+        entry, where = entries[index], entries[index].where
+        if "perFrameIntrinsicCoeffs" in entry:
+            K = entry.matrix("perFrameIntrinsicCoeffs", 4)
+        else:
+            K = data.matrix("K", 9)[[0, 4, 6, 7]]  # which is stored column by column
+        x, y, z, w, *position = entry.matrix("poses", 7)
+        R_world_cam = rotation_of(np.array([w, x, y, z]), where) @ OPENGL_TO_OPENCV
+        pose, name = world_to_camera(R_world_cam, np.array(position)), ImageName(f"{images.name}/{file.name}")
+        time = number(entry.values[timed], timed, where) if timed in entry else index / data.number("fps", 1e-9, 1e5)
+        frames.append(Frame(check_image(file), Lens(*size, *K.tolist()), pose, where, name, time))
+    absent = count - len(files)
+    warnings = [f"{images} holds {len(files)} images for {count} poses; the other poses are left out."]
     return Capture(
         frames,
         source=path,
@@ -92,22 +77,13 @@ def _read_polycam(folder: Path, image_size: int | None) -> Capture:
         raise InputError(f"{cameras} holds no camera (.json); export raw data from Polycam again.")
     frames = []
     for path in described:
-        name = files.find_image(path.stem, f"{path} describes its camera")
-        if name is None:
-            continue
-        data = read_json(path)
-        fx, fy, cx, cy = (data.number(k, -LARGEST_INTRINSIC, LARGEST_INTRINSIC) for k in ("fx", "fy", "cx", "cy"))
-        rows = [[data.required(f"t_{i}{j}") for j in range(4)] for i in range(3)]
-        frames.append(
-            Frame(
-                check_image(images / name),
-                Lens(data.side("width"), data.side("height"), fx, fy, cx, cy),
-                opengl_pose(rows, str(path)),
-                str(path),
-                ImageName(name),
-                data.number("timestamp", -1e18, 1e18),
-            )
-        )
+        if name := files.find_image(path.stem, f"{path} describes its camera"):
+            data = read_json(path)
+            fx, fy, cx, cy = (data.number(k, -LARGEST_INTRINSIC, LARGEST_INTRINSIC) for k in ("fx", "fy", "cx", "cy"))
+            lens = Lens(data.side("width"), data.side("height"), fx, fy, cx, cy)
+            pose = opengl_pose([[data.required(f"t_{i}{j}") for j in range(4)] for i in range(3)], str(path))
+            time = data.number("timestamp", -1e18, 1e18)
+            frames.append(Frame(check_image(images / name), lens, pose, str(path), ImageName(name), time))
     warnings = files.left_out(len(described), cameras)
     count = sum(file.suffix.lower() in SUFFIXES for file in listed(images))
     undescribed = count - len(frames)
@@ -124,6 +100,6 @@ def _read_polycam(folder: Path, image_size: int | None) -> Capture:
 
 
 READERS = (
-    Reader("Record3D", "metadata.json beside rgb/0.jpg", lambda f: _record3d_layout(f) is not None, _read_record3d),
+    Reader("Record3D", "metadata.json beside rgb/0.jpg", lambda f: bool(_record3d_layouts(f)), _read_record3d),
     Reader("Polycam", "keyframes/cameras/*.json", lambda f: _subfolder(f, "cameras").is_dir(), _read_polycam),
 )

@@ -27,9 +27,7 @@ def _read(folder: Path, image_size: int | None) -> Capture:
     chosen, model = max(models.items(), key=lambda item: len(item[1].images))  # the first of equal ones
     if not model.images:
         raise InputError(f"{chosen} holds no image with a pose; let COLMAP register the images again.")
-    files = [name for name in files_below(images) if name.lower().endswith(SUFFIXES)]
-    registered, warnings = _registered(model, images, files)
-    frames = _frames(model, registered, images, files, warnings)
+    frames, warnings, left_out = _frames(model, images)
     if len(models) > 1:
         sizes = ", ".join(f"{path.name} with {len(other.images)}" for path, other in models.items())
         warnings.append(f"{folder / SPARSE} holds {len(models)} models ({sizes} images): {chosen.name} is taken.")
@@ -42,7 +40,7 @@ def _read(folder: Path, image_size: int | None) -> Capture:
         model.points_file,
         model.cloud,
         warnings=warnings,
-        left_out=len(files) - len(frames) + len(model.images) - len(registered),
+        left_out=left_out,
         shares_cameras=True,
         own_footage=True,
     )
@@ -56,44 +54,34 @@ def _models(folder: Path) -> list[Path]:
     return sorted((path for path in sparse.glob("*") if is_model(path)), key=lambda path: natural_key(path.name))
 
 
-def _registered(model: ColmapModel, images: Path, files: list[str]) -> tuple[dict[str, ColmapImage], list[str]]:
-    """Return the images of the model by the names of their files, and a warning about those that have no file."""
+def _frames(model: ColmapModel, images: Path) -> tuple[list[Frame], list[str], int]:
+    """Return the images with a pose, their own or that of their still camera; warnings about files without a pose and
+    poses without a file, and how many these are."""
+    files = [name for name in files_below(images) if name.lower().endswith(SUFFIXES)]
     finder, existing, registered = CaptureFiles(images), set(files), dict[str, ColmapImage]()
     for image in sorted(model.images, key=lambda image: image.name not in existing):
-        name = finder.find_image(image.name, f"{image.where} names it")
-        if name is not None and registered.setdefault(name, image) is not image:  # another image's file
+        found = finder.find_image(image.name, f"{image.where} names it")
+        if found is not None and registered.setdefault(found, image) is not image:  # another image's file
             finder.absent.append(f"{images / image.name} does not exist, but {image.where} names it")
-    return registered, finder.left_out(len(model.images), model.images_file)
-
-
-def _frames(
-    model: ColmapModel, registered: dict[str, ColmapImage], images: Path, files: list[str], warnings: list[str]
-) -> list[Frame]:
-    """Return the images with a pose, their own or that of their still camera. Appends a warning about those without."""
+    warnings = finder.left_out(len(model.images), model.images_file)
     places = {file: place_of(image.T_cam_world) for file, image in registered.items()}
     names = image_names(files, places)
-    first: dict[str, ColmapImage] = {}  # of each camera
-    for name in names:
-        if name.file in registered:
-            first.setdefault(name.camera, registered[name.file])
+    first = {name.camera: registered[name.file] for name in reversed(names) if name.file in registered}
     still = first if stand_still(names, places) else {}
     frames: list[Frame] = []
     left_out: list[str] = []
     for name in names:
-        posed = registered.get(name.file) or still.get(name.camera)
-        if posed is None:
+        if posed := registered.get(name.file) or still.get(name.camera):
+            lens, where = model.cameras[posed.camera], f"{model.cameras_file}, camera {posed.camera},"
+            frames.append(Frame(check_image(images / name.file), lens, posed.T_cam_world, where, name))
+        else:
             left_out.append(name.file)
-            continue
-        where = f"{model.cameras_file}, camera {posed.camera},"
-        frames.append(
-            Frame(check_image(images / name.file), model.cameras[posed.camera], posed.T_cam_world, where, name)
-        )
     if left_out:
         warnings.append(
             f"{len(left_out)} of {len(files)} images below {images} are left out, such as {left_out[0]}: "
             f"{model.images_file} holds no pose for them."
         )
-    return frames
+    return frames, warnings, len(left_out) + len(finder.absent)
 
 
 READERS = (Reader("COLMAP", "sparse/0/cameras.bin or .txt beside images/", lambda f: bool(_models(f)), _read),)

@@ -14,28 +14,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.cloud import Cloud
-from lapgs_wgpu.data.json_fields import LARGEST_ENTRY, LARGEST_INTRINSIC, LARGEST_SIDE
+from lapgs_wgpu.data.json_fields import LARGEST_ENTRY, LARGEST_INTRINSIC, LARGEST_SIDE, TINY, number
 from lapgs_wgpu.data.lens import Lens
-from lapgs_wgpu.data.poses import unit_quaternion
+from lapgs_wgpu.data.poses import rotation_of
 from lapgs_wgpu.errors import InputError, shown
-from lapgs_wgpu.splat.camera import rotation_matrix
 
 Array = NDArray[np.float64]
 
-# Number in binary files -> name, and the names of the parameters. Of these, those that are read.
-MODELS: dict[int, tuple[str, tuple[str, ...]]] = {
-    0: ("SIMPLE_PINHOLE", ("f", "cx", "cy")),
-    1: ("PINHOLE", ("fx", "fy", "cx", "cy")),
-    2: ("SIMPLE_RADIAL", ("f", "cx", "cy", "k1")),
-    3: ("RADIAL", ("f", "cx", "cy", "k1", "k2")),
-    4: ("OPENCV", ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
+MODELS = (  # by their numbers in binary files
+    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
+    "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE", "SIMPLE_DIVISION",
+    "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM", "EQUIRECTANGULAR",
+)  # fmt: skip
+PARAMETERS = {  # of those that are read
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
 }
-OTHER_MODELS = {
-    5: "OPENCV_FISHEYE", 6: "FULL_OPENCV", 7: "FOV", 8: "SIMPLE_RADIAL_FISHEYE", 9: "RADIAL_FISHEYE",
-    10: "THIN_PRISM_FISHEYE", 11: "RAD_TAN_THIN_PRISM_FISHEYE", 12: "SIMPLE_DIVISION", 13: "DIVISION",
-    14: "SIMPLE_FISHEYE", 15: "FISHEYE", 16: "EUCM", 17: "EQUIRECTANGULAR",
-}  # fmt: skip
-PARAMETERS = dict(MODELS.values())
 _NUMBERS = re.compile(r"([-+.\deE\s]|nan|inf)*")
 
 
@@ -68,30 +65,27 @@ def is_model(folder: Path) -> bool:
 def read_model(folder: Path) -> ColmapModel:
     """The sparse model in a folder; binary files go before text. Raises InputError."""
     binary = (folder / "cameras.bin").is_file()
-    files = {name: folder / f"{name}.{'bin' if binary else 'txt'}" for name in ("cameras", "images", "points3D")}
-    for path in files.values():
+    files = [folder / f"{name}.{'bin' if binary else 'txt'}" for name in ("cameras", "images", "points3D")]
+    cameras_file, images_file, points_file = files
+    for path in files:
         if not path.is_file():
-            raise InputError(f"{path} does not exist, but {files['cameras']} does; copy it, too.")
+            raise InputError(f"{path} does not exist, but {cameras_file} does; copy it, too.")
     try:
-        cameras = dict((_binary_cameras if binary else _text_cameras)(files["cameras"]))
-        images = list((_binary_images if binary else _text_images)(files["images"]))
-        rows = list((_binary_points if binary else _text_points)(files["points3D"]))
+        cameras = dict((_binary_cameras if binary else _text_cameras)(cameras_file))
+        images = list((_binary_images if binary else _text_images)(images_file))
+        rows = list((_binary_points if binary else _text_points)(points_file))
     except OSError as error:
         raise InputError(f"{error.filename or folder} cannot be read ({error.strerror or error}).") from error
     for image in images:
         if image.camera not in cameras:
-            raise InputError(
-                f"{image.where} names camera {image.camera}, none of {len(cameras)} in {files['cameras']}."
-            )
+            raise InputError(f"{image.where} names camera {image.camera}, none of {len(cameras)} in {cameras_file}.")
     points, colors = np.split(np.array(rows, np.float64).reshape(-1, 6), 2, axis=1)
     bad = np.flatnonzero(~(np.abs(points) <= LARGEST_ENTRY).all(axis=1))  # true for NaN, too
     if len(bad):
-        raise InputError(
-            f"{files['points3D']}: {len(bad)} of {len(points)} are not finite, first {bad[0]}; remove them."
-        )
+        raise InputError(f"{points_file}: {len(bad)} of {len(points)} are not finite, first {bad[0]}; remove them.")
     levels = np.clip(np.nan_to_num(colors), 0, 255).astype(np.uint8)
     cloud = Cloud(points, (levels / 255).astype(np.float32)) if len(points) else None
-    return ColmapModel(cameras, images, cloud, *files.values())
+    return ColmapModel(cameras, images, cloud, cameras_file, images_file, points_file)
 
 
 def _camera(where: str, model: str, width: float, height: float, values: Sequence[float]) -> Lens:
@@ -104,23 +98,21 @@ def _camera(where: str, model: str, width: float, height: float, values: Sequenc
         raise InputError(f"{where}: a {model} has {len(names)} parameters ({', '.join(names)}), not {len(values)}.")
     if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE):
         raise InputError(f"{where}: sides must be 1 to {LARGEST_SIDE:g} pixels, got {shown(width)}x{shown(height)}.")
-    p = dict(zip(names, values, strict=True))
-    for name, value in p.items():
-        if not abs(value) <= LARGEST_INTRINSIC or (name[0] == "f" and value <= 0):  # true for NaN, too
-            raise InputError(f"{where}: {name} is {value:g}, which no camera has.")
-    fx, fy = p.get("fx", p.get("f", 0.0)), p.get("fy", p.get("f", 0.0))
+    p = {
+        name: number(value, name, where, TINY if name[0] == "f" else -LARGEST_INTRINSIC, LARGEST_INTRINSIC)
+        for name, value in zip(names, values, strict=True)
+    }
+    fx, fy = (p.get("f") or p[name] for name in ("fx", "fy"))
     radial, tangential = (p.get("k1", 0.0), p.get("k2", 0.0), 0.0), (p.get("p1", 0.0), p.get("p2", 0.0))
     return Lens(int(width), int(height), fx, fy, p["cx"], p["cy"], radial=radial, tangential=tangential)
 
 
 def _image(name: str, camera: int, values: Sequence[float], where: str) -> ColmapImage:
-    """Check the values of an image: a quaternion and a translation. Raises InputError."""
-    pose = np.array(values)
-    bad = ~(np.abs(pose) <= LARGEST_ENTRY)  # true for NaN, too
-    if bad.any():
-        raise InputError(f"{where}: its pose holds {pose[bad][0]:g}; at most {LARGEST_ENTRY:g} is allowed.")
+    """values: a quaternion and a translation. Raises InputError."""
+    bounds = -LARGEST_ENTRY, LARGEST_ENTRY
+    pose = np.array([number(value, "each number of its pose", where, *bounds) for value in values])
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = rotation_matrix(unit_quaternion(pose[:4], where)), pose[4:]
+    T[:3, :3], T[:3, 3] = rotation_of(pose[:4], where), pose[4:]
     return ColmapImage(name, camera, T, where)
 
 
@@ -131,9 +123,9 @@ def _lines(path: Path) -> Iterator[tuple[str, str]]:
     """Yield the place of each line, for errors, and the line; neither comments nor empty ones."""
     try:
         with path.open(encoding="utf-8") as file:
-            for number, line in enumerate(file, start=1):
+            for at, line in enumerate(file, start=1):
                 if line.strip() and not line.startswith("#"):
-                    yield f"{path}, line {number}", line.strip()
+                    yield f"{path}, line {at}", line.strip()
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not text ({error.reason}); copy it or export the model again.") from None
 
@@ -215,8 +207,9 @@ def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
     file = _Bytes(path)
     for index in file.entries():
         identity, model, width, height = file.values("iiQQ")
-        name, names = MODELS.get(model, (OTHER_MODELS.get(model, f"number {model}"), ()))
-        yield identity, _camera(f"{path}, camera {index}", name, width, height, file.values(f"{len(names)}d"))
+        name = MODELS[model] if 0 <= model < len(MODELS) else f"number {model}"
+        values = file.values(f"{len(PARAMETERS.get(name, ()))}d")
+        yield identity, _camera(f"{path}, camera {index}", name, width, height, values)
 
 
 def _binary_images(path: Path) -> Iterator[ColmapImage]:

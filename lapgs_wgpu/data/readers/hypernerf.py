@@ -13,7 +13,7 @@ from lapgs_wgpu.data.capture_files import CaptureFiles
 from lapgs_wgpu.data.cloud import find_cloud, read_cloud
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import check_image
-from lapgs_wgpu.data.json_fields import LARGEST_SIDE, Fields, as_fields, matrix, number, read_json
+from lapgs_wgpu.data.json_fields import LARGEST_SIDE, TINY, Fields, as_fields, number, read_json
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.normalize import Normalization
 from lapgs_wgpu.data.poses import check_rotation, world_to_camera
@@ -21,33 +21,33 @@ from lapgs_wgpu.data.stamps import ImageName
 from lapgs_wgpu.errors import InputError, shown
 
 CLOUDS = ("points.npy", "points3D_downsample*.ply", "points3D.ply")  # all in the coordinates of the camera files
-TINY = 1e-12  # smaller values count as 0
 STRIDE = 4  # without val_ids: every fourth id from the first on is for training, from the third on for testing
+DEFAULTS = {"pixel_aspect_ratio": 1, "skew": 0, "radial_distortion": [0] * 3, "tangential_distortion": [0] * 2}
 
 
 def _read(folder: Path, image_size: int | None) -> Capture:
     """Images come from the folder rgb/Nx with the smallest that are at least of the wanted size, else the largest."""
-    ids, train_ids, test_ids = _splits(read_json(folder / "dataset.json"))
+    ids, splits = _splits(read_json(folder / "dataset.json"))
     scene = read_json(folder / "scene.json")
-    moved = Normalization(scene.vector("center", 3), scene.number("scale", TINY))
+    moved = Normalization(scene.matrix("center", 3), scene.number("scale", TINY))
     depths = scene.number("near", TINY), scene.number("far", TINY)
     if depths[0] >= depths[1]:
         raise InputError(f"{scene.where}: near must be below far, got {depths[0]:g} and {depths[1]:g}.")
-    times = _times(read_json(folder / "metadata.json"), ids)
-    rgb = _image_folder(folder / "rgb", train_ids + test_ids, image_size)
-    files = CaptureFiles(rgb)
-    splits: dict[Split, list[str]] = {"train": train_ids, "test": test_ids}
-    frames = []
+    metadata = read_json(folder / "metadata.json")
+    stated = {name: as_fields(metadata.required(name), f"{metadata.where}: {name}") for name in ids}
+    field = "time_id" if any("time_id" in entry for entry in stated.values()) else "warp_id"
+    times = {name: int(entry.number(field, 0)) for name, entry in stated.items()}
+    named = [name for names in splits.values() for name in names]
+    rgb = _image_folder(folder / "rgb", named, image_size)
+    files, frames = CaptureFiles(rgb), []
     for split, names in splits.items():
         for index, name in enumerate(names):
-            image = files.find_image(f"{name}.png", f"dataset.json names {name}")
-            if image is None:
-                continue
-            where = folder / "camera" / f"{name}.json"
-            lens, pose = _read_camera(read_json(where))
-            told = f"{where} (image_size, focal_length, radial_distortion, tangential_distortion)"
-            taken = check_image(rgb / image), lens, moved.pose(pose), told, ImageName(name)
-            frames.append(Frame(*taken, times[name], split, f"{index:03d}", depths))
+            if image := files.find_image(f"{name}.png", f"dataset.json names {name}"):
+                camera = read_json(folder / "camera" / f"{name}.json")
+                lens, pose = _read_camera(camera)
+                where = f"{camera.where} (image_size, focal_length, radial_distortion, tangential_distortion)"
+                taken = check_image(rgb / image), lens, moved.pose(pose), where, ImageName(name)
+                frames.append(Frame(*taken, times[name], split, f"{index:03d}", depths))
     cloud = find_cloud(folder, CLOUDS)
     return Capture(
         frames,
@@ -55,18 +55,20 @@ def _read(folder: Path, image_size: int | None) -> Capture:
         source=cloud or folder / "scene.json",
         time_source=f"time_id (else warp_id) in {folder / 'metadata.json'}",
         time_range=(min(times.values()), max(times.values())),
-        warnings=files.left_out(len(train_ids) + len(test_ids), folder / "dataset.json"),
+        warnings=files.left_out(len(named), folder / "dataset.json"),
         left_out=len(files.absent),
         moved=moved,
     )
 
 
-def _splits(data: Fields) -> tuple[list[str], list[str], list[str]]:
+def _splits(data: Fields) -> tuple[list[str], dict[Split, list[str]]]:
     """Return all ids, and those to train on and to test on."""
-    ids, given = _names(data, "ids"), bool(data.values.get("val_ids"))
-    train = _names(data, "train_ids") if given else ids[::STRIDE]
-    test = _names(data, "val_ids") if given else ids[STRIDE // 2 :: STRIDE]  # "interp": the frames between
-    if not train or not test:
+    ids = _names(data, "ids")
+    if data.values.get("val_ids"):
+        train, test = _names(data, "train_ids"), _names(data, "val_ids")
+    else:  # "interp": the frames between
+        train, test = ids[::STRIDE], ids[STRIDE // 2 :: STRIDE]
+    if not test:
         raise InputError(f"{data.where}: {len(train)} train_ids and {len(test)} test ids; at least one of each.")
     if both := set(train) & set(test):
         raise InputError(
@@ -74,35 +76,25 @@ def _splits(data: Fields) -> tuple[list[str], list[str], list[str]]:
             "may be trained on: remove them from one of the two."
         )
     if unknown := {*train, *test} - {*ids}:
-        raise InputError(
-            f"{data.where}: train_ids or val_ids name {min(unknown)}, none of its {len(ids)} ids; add it there."
-        )
-    return ids, train, test
+        raise InputError(f"{data.where}: train_ids or val_ids name {min(unknown)}, none of its {len(ids)} ids; add it.")
+    return ids, {"train": train, "test": test}
 
 
-def _times(metadata: Fields, ids: Sequence[str]) -> dict[str, int]:
-    entries = {name: as_fields(metadata.required(name), f"{metadata.where}: {name}") for name in ids}
-    field = "time_id" if any("time_id" in entry for entry in entries.values()) else "warp_id"
-    return {name: int(entry.number(field, 0)) for name, entry in entries.items()}
-
-
-def _read_camera(data: Fields) -> tuple[Lens, np.ndarray]:
+def _read_camera(stated: Fields) -> tuple[Lens, np.ndarray]:
     """Return the lens and the pose of a camera file, in the file's coordinates."""
-    R_cam_world = matrix(data.required("orientation"), (3, 3), "orientation", data.where)
+    data = Fields(DEFAULTS | stated.values, stated.where)
+    R_cam_world = data.matrix("orientation", 3, 3)
     check_rotation(R_cam_world.T, f"{data.where}: orientation")
-    width, height = (
-        int(number(side, "image_size", data.where, 1, LARGEST_SIDE)) for side in data.entries("image_size", 2)
-    )
-    focal = data.number("focal_length", TINY)
-    aspect = data.number("pixel_aspect_ratio", TINY) if "pixel_aspect_ratio" in data else 1.0
-    cx, cy = data.vector("principal_point", 2).tolist()
-    skew = data.number("skew") if "skew" in data else 0.0
-    k1, k2, k3 = data.vector("radial_distortion", 3).tolist() if "radial_distortion" in data else [0.0] * 3
+    sides = (number(side, "image_size", data.where, 1, LARGEST_SIDE) for side in data.entries("image_size", 2))
+    width, height = map(int, sides)
+    fx = data.number("focal_length", TINY)
+    fy = fx * data.number("pixel_aspect_ratio", TINY)
+    cx, cy = data.matrix("principal_point", 2).tolist()
+    k1, k2, k3 = data.matrix("radial_distortion", 3).tolist()
     # nerfies has written the second name, and its first releases the first one.
-    tangential = "tangential" if "tangential" in data else "tangential_distortion"
-    p1, p2 = data.vector(tangential, 2).tolist() if tangential in data else [0.0] * 2
-    lens = Lens(width, height, focal, focal * aspect, cx, cy, skew, (k1, k2, k3), (p1, p2))
-    return lens, world_to_camera(R_cam_world.T, data.vector("position", 3))
+    p1, p2 = data.matrix("tangential" if "tangential" in data else "tangential_distortion", 2).tolist()
+    lens = Lens(width, height, fx, fy, cx, cy, data.number("skew"), (k1, k2, k3), (p1, p2))
+    return lens, world_to_camera(R_cam_world.T, data.matrix("position", 3))
 
 
 def _image_folder(rgb: Path, names: Sequence[str], image_size: int | None) -> Path:

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.data.cloud import Cloud, find_cloud, points_at, read_cloud, read_npy
 from lapgs_wgpu.data.evenly import evenly
-from lapgs_wgpu.data.frames import Capture, Frame, Reader
+from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import SUFFIXES, ImageFile, check_image, decode, decode_gray, size_text
-from lapgs_wgpu.data.json_fields import LARGEST_ENTRY, LARGEST_SIDE
+from lapgs_wgpu.data.json_fields import LARGEST_ENTRY, LARGEST_SIDE, number
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.poses import check_rotation, world_to_camera
 from lapgs_wgpu.data.stamps import ImageName, natural_key
@@ -59,27 +59,22 @@ def _read_rows(path: Path, names: Sequence[str], what: str, axes: Array) -> list
             f"{path} holds {len(rows)} poses, but there are {len(names)} {what}, {names[0]} to {names[-1]}; each of "
             "them needs a row, in this order."
         )
-    return [_row(row, f"{path}, row {i} ({name})", axes) for i, (row, name) in enumerate(zip(rows, names, strict=True))]
-
-
-def _row(row: Array, where: str, axes: Array) -> dict[str, Any]:
-    bad = ~(np.abs(row) <= LARGEST_ENTRY)  # true for NaN, too
-    if bad.any():
-        column = int(np.argmax(bad))
-        raise InputError(f"{where} holds {row[column]:g} in column {column}; it must be at most {LARGEST_ENTRY:g}.")
-    pose, (near, far) = row[:15].reshape(3, 5), row[15:]
-    height, width, focal = pose[:, 4].tolist()
-    if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE and focal > 0):
-        raise InputError(f"{where}: height, width, focal length must be above 0, got {height:g}, {width:g}, {focal:g}.")
-    if not 0 < near < far:
-        raise InputError(f"{where}: the depth bounds must be 0 < near < far, got {near:g} and {far:g}.")
-    check_rotation(pose[:, :3], f"{where}: the pose")
-    return {
-        "lens": Lens(round(width), round(height), focal, focal, width / 2, height / 2),
-        "T_cam_world": world_to_camera(pose[:, :3] @ axes, pose[:, 3]),
-        "where": where,
-        "depths": (float(near), float(far)),
-    }
+    found: list[dict[str, Any]] = []
+    for i, (row, name) in enumerate(zip(rows, names, strict=True)):
+        where = f"{path}, row {i} ({name})"
+        for column, value in enumerate(row.tolist()):
+            number(value, f"column {column}", where, -LARGEST_ENTRY, LARGEST_ENTRY)
+        pose, (near, far) = row[:15].reshape(3, 5), row[15:].tolist()
+        height, width, f = pose[:, 4].tolist()
+        if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE and f > 0):
+            raise InputError(f"{where}: height, width, focal length must be above 0, got {height:g}, {width:g}, {f:g}.")
+        if not 0 < near < far:
+            raise InputError(f"{where}: the depth bounds must be 0 < near < far, got {near:g} and {far:g}.")
+        check_rotation(pose[:, :3], f"{where}: the pose")
+        lens = Lens(round(width), round(height), f, f, width / 2, height / 2)
+        T_cam_world = world_to_camera(pose[:, :3] @ axes, pose[:, 3])
+        found.append({"lens": lens, "T_cam_world": T_cam_world, "where": where, "depths": (near, far)})
+    return found
 
 
 # Neu3D
@@ -103,19 +98,14 @@ def _read_neu3d(folder: Path, image_size: int | None) -> Capture:
                 f"{other} has {len(recordings[other])} frames and {first} has {count}; all cameras must have as many: "
                 "cut them to the same frames."
             )
-    frames = [
-        Frame(
-            image,
+    frames = []
+    for (recording, images), row in zip(recordings.items(), rows, strict=True):
+        camera = recording.stem
+        split: Split = "test" if recording is first else "train"
+        for index, image in enumerate(images):
             # Masks of a film's frames are named by their numbers from 0 on.
-            name=ImageName(f"{recording.stem}/{f'{index}.png' if image.source else image.path.name}", recording.stem),
-            time=index,
-            split="test" if recording is first else "train",
-            label=f"{recording.stem}_{index:05d}",
-            **row,
-        )
-        for (recording, images), row in zip(recordings.items(), rows, strict=True)
-        for index, image in enumerate(images)
-    ]
+            name = ImageName(f"{camera}/{f'{index}.png' if image.source else image.path.name}", camera)
+            frames.append(Frame(image, name=name, time=index, split=split, label=f"{camera}_{index:05d}", **row))
     cloud = find_cloud(folder, CLOUDS)
     return Capture(
         frames,
@@ -130,9 +120,7 @@ def _read_neu3d(folder: Path, image_size: int | None) -> Capture:
 
 def _recordings(folder: Path, image_size: int | None) -> dict[Path, list[ImageFile]]:
     """Return the frames of each camera, by its number: its images if all cameras have them, else those of its film."""
-    children = sorted(
-        (c for c in folder.iterdir() if CAMERA.fullmatch(c.stem)), key=lambda child: natural_key(child.stem)
-    )
+    children = sorted((c for c in folder.iterdir() if CAMERA.fullmatch(c.stem)), key=lambda c: natural_key(c.stem))
     films = [child for child in children if child.suffix.lower() == ".mp4"]
     folders = [child for child in children if (child / IMAGES).is_dir()]
     cameras = {child.stem for child in (*films, *folders)}
@@ -163,16 +151,10 @@ def _read_endonerf(folder: Path, image_size: int | None) -> Capture:
     images = _images(folder / IMAGES, whole=True)
     names = [image.path.name for image in images]
     rows = _read_rows(path, names, "images", np.eye(3))
-    frames = [
-        Frame(
-            image,
-            name=ImageName(name),
-            time=index,
-            split="test" if index % EVERY == FIRST else "train",
-            **row,
-        )
-        for index, (image, name, row) in enumerate(zip(images, names, rows, strict=True))
-    ]
+    frames = []
+    for index, (image, name, row) in enumerate(zip(images, names, rows, strict=True)):
+        split: Split = "test" if index % EVERY == FIRST else "train"
+        frames.append(Frame(image, name=ImageName(name), time=index, split=split, **row))
     cloud = _depth_cloud(folder, frames) if (folder / DEPTH).is_dir() else None
     depth = f"depths are those of {folder / DEPTH}" if cloud is not None else "depths are a guess between the bounds"
     poses = len({frame.T_cam_world.tobytes() for frame in frames})
@@ -190,9 +172,7 @@ def _depth_cloud(folder: Path, frames: list[Frame]) -> Cloud:
     """Make points at the depths of some of the maps, in their images' colors. Raises InputError."""
     maps = [image.path for image in _images(folder / DEPTH)]
     if len(maps) != len(frames):
-        raise InputError(
-            f"{folder / DEPTH} holds {len(maps)} maps for {len(frames)} images; add the rest, or remove it."
-        )
+        raise InputError(f"{folder / DEPTH} has {len(maps)} maps for {len(frames)} images; add the rest, or remove it.")
     chosen = evenly(list(zip(frames, maps, strict=True)), MAPS)
     random, points, colors = np.random.default_rng(0), [], []
     for frame, path in chosen:
@@ -214,17 +194,9 @@ def _depth_cloud(folder: Path, frames: list[Frame]) -> Cloud:
     return Cloud(np.concatenate(points).astype(np.float32), np.concatenate(colors).astype(np.float32))
 
 
+FILMS = f"{POSES} beside cam00.mp4, ... or cam00/images/, ..."
+ALONE = f"{POSES} beside images/"
 READERS = (
-    Reader(
-        "Neu3D",
-        "poses_bounds.npy beside cam00.mp4, ... or cam00/images/, ...",
-        lambda folder: (folder / POSES).is_file() and not (folder / IMAGES).is_dir(),
-        _read_neu3d,
-    ),
-    Reader(
-        "EndoNeRF",
-        "poses_bounds.npy beside images/",
-        lambda folder: (folder / POSES).is_file() and (folder / IMAGES).is_dir(),
-        _read_endonerf,
-    ),
+    Reader("Neu3D", FILMS, lambda f: (f / POSES).is_file() and not (f / IMAGES).is_dir(), _read_neu3d),
+    Reader("EndoNeRF", ALONE, lambda f: (f / POSES).is_file() and (f / IMAGES).is_dir(), _read_endonerf),
 )

@@ -21,6 +21,7 @@ from lapgs_wgpu.data.validation import check_frames
 from lapgs_wgpu.errors import InputError, shown
 from lapgs_wgpu.splat.camera import intrinsics_of_fov
 
+TRAIN, TEST = "transforms_train.json", "transforms_test.json"  # D-NeRF's
 CLOUDS = ("fused.ply", "points3d.ply", "points3D.ply")
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 SIDE, FOCAL, ANY = (1, LARGEST_SIDE), (1e-9, LARGEST_INTRINSIC), (-LARGEST_INTRINSIC, LARGEST_INTRINSIC)
@@ -30,28 +31,23 @@ INTRINSICS = {  # bounds, in pixels of an image w x h
 }  # fmt: skip
 
 
-def _read_frames(data: Fields, files: CaptureFiles, time: str) -> list[Frame | None]:
-    """Return the frame of each entry of a transforms file, None where its image does not exist.
-
-    time: the field of the times, in all entries or in none. Raises InputError.
-    """
+def _read_frames(data: Fields, files: CaptureFiles, time: str) -> dict[int, Frame]:
+    """Return the frames of a transforms file whose images exist, by the places of their entries. time: the field of the
+    times, in all entries or in none. Raises InputError."""
     entries = data.objects("frames", "frame")
     timed = sum(_states(entry, time) for entry in entries)
-    frames: list[Frame | None] = []
-    for entry in entries:
+    frames = {}
+    for index, entry in enumerate(entries):
         if timed and not _states(entry, time):
             raise InputError(
                 f"{entry.where} has no field {time}, though {timed} of {len(entries)} frames have it; give it for all."
             )
-        stated = number(entry.required(time), time, entry.where) if timed else None
+        stated = number(entry.values[time], time, entry.where) if timed else None
         pose = opengl_pose(entry.required("transform_matrix"), entry.where)
-        found = files.image(entry, "file_path")
-        if found is None:
-            frames.append(None)
-            continue
-        name, image = found
-        lens, sized = read_lens(entry, data, image)
-        frames.append(Frame(image, lens, pose, entry.where, ImageName(name), time=stated, states_size=sized))
+        if found := files.image(entry, "file_path"):
+            name, image = found
+            lens, sized = read_lens(entry, data, image)
+            frames[index] = Frame(image, lens, pose, entry.where, ImageName(name), time=stated, states_size=sized)
     return frames
 
 
@@ -60,11 +56,9 @@ def _states(entry: Fields, field: str) -> bool:
 
 
 def read_lens(frame: Fields, shared: Fields, image: ImageFile) -> tuple[Lens, bool]:
-    """Return the lens of a frame, and whether size or center are stated; each value is the frame's, else its file's.
-
-    A missing size is the image's; the focal length is that of camera_angle_x (radians) where fl_x is missing. Raises
-    InputError, also for other lens models.
-    """
+    """Return the lens of a frame, and whether size or center are stated; each value is the frame's, else its file's. A
+    missing size is the image's; the focal length is that of camera_angle_x (radians) where fl_x is missing. Raises
+    InputError, also for other lens models."""
 
     def source(name: str) -> Fields:
         return frame if name in frame else shared
@@ -72,14 +66,9 @@ def read_lens(frame: Fields, shared: Fields, image: ImageFile) -> tuple[Lens, bo
     model = source("camera_model").values.get("camera_model", "OPENCV")
     if model not in MODELS or source("is_fisheye").values.get("is_fisheye"):
         named = shown(model) if model not in MODELS else "is_fisheye"
-        raise InputError(
-            f"{frame.where}: camera_model {named} is none that is read ({', '.join(MODELS)}); undistort the images."
-        )
-    values = {
-        name: source(name).number(name, least, most)
-        for name, (least, most) in INTRINSICS.items()
-        if source(name).values.get(name) is not None
-    }
+        raise InputError(f"{frame.where}: camera_model {named} is none of {', '.join(MODELS)}; undistort the images.")
+    stated = [name for name in INTRINSICS if _states(source(name), name)]
+    values = {name: source(name).number(name, *INTRINSICS[name]) for name in stated}
     centered = {"cx", "cy"} <= values.keys()
     size = image.size
     if centered and image.orientation >= SIDEWAYS:  # of the two sizes, that whose middle is nearer
@@ -113,28 +102,23 @@ def _read_nerfstudio(folder: Path, image_size: int | None) -> Capture:
     time = "time" if any(_states(entry, "time") for entry in entries) else "timestamp"
     read = _read_frames(data, files, time)
     warnings = files.left_out(len(entries), path)
-    frames = [
-        dataclasses.replace(frame, mask=files.optional(entry, "mask_path"), mask_kind="black")
-        for frame, entry in zip(read, entries, strict=True)
-        if frame is not None
-    ]
-    names = [frame.name.file for frame in frames]
-    if len(set(names)) < len(names):
-        twice = next(name for i, name in enumerate(names) if name in names[:i])
-        raise InputError(f"{path}: {len(names)} frames name {len(set(names))} images; keep one frame of {twice}.")
-    if splits := _splits(data, names, files):
-        unlisted = [name for name in names if name not in splits]
-        frames = [dataclasses.replace(frame, split=splits.get(frame.name.file)) for frame in frames]
-        frames = [frame for frame in frames if frame.split is not None]
-        if unlisted:
+    frames: dict[str, Frame] = {}
+    for index, frame in read.items():
+        file, mask = frame.name.file, files.optional(entries[index], "mask_path")
+        if file in frames:
+            raise InputError(f"{frame.where} and {frames[file].where} name the same image, {file}; keep one of them.")
+        frames[file] = dataclasses.replace(frame, mask=mask, mask_kind="black")
+    if splits := _splits(data, list(frames), files):
+        if unlisted := [file for file in frames if file not in splits]:
             warnings.append(
-                f"{path}: {len(unlisted)} of {len(names)} images, such as {unlisted[0]}, are in none of "
+                f"{path}: {len(unlisted)} of {len(frames)} images, such as {unlisted[0]}, are in none of "
                 "train_filenames, val_filenames and test_filenames, and are left out."
             )
-    named = image_names([frame.name.file for frame in frames], {frame.name.file: frame.place for frame in frames})
+        frames = {f: dataclasses.replace(frame, split=splits[f]) for f, frame in frames.items() if f in splits}
+    names = image_names(list(frames), {file: frame.place for file, frame in frames.items()})
     cloud = files.optional(data, "ply_file_path")
     return Capture(
-        [dataclasses.replace(frame, name=name) for frame, name in zip(frames, named, strict=True)],
+        [dataclasses.replace(frames[name.file], name=name) for name in names],
         cloud=None if cloud is None else read_cloud(cloud),
         source=cloud or path,
         warnings=warnings,
@@ -146,32 +130,27 @@ def _read_nerfstudio(folder: Path, image_size: int | None) -> Capture:
 
 
 def _splits(data: Fields, names: list[str], files: CaptureFiles) -> dict[str, Split]:
-    """Return the split of each image, as the file's lists state it; {} if they hold nothing out.
-
-    An image in no list is for training, but missing here if the file lists those for training.
-    """
-    test, validation, train = (_listed(data, f"{split}_filenames", names, files) for split in ("test", "val", "train"))
-    if not test:  # one list is enough to measure by
-        test, validation = validation, []
-    if not test:
-        return {}
-    splits: dict[str, Split] = dict.fromkeys(train or names, "train")
-    return splits | dict.fromkeys(validation, "val") | dict.fromkeys(test, "test")
-
-
-def _listed(data: Fields, field: str, names: list[str], files: CaptureFiles) -> list[str]:
-    """Return the images that a list of the file names and that exist. Raises InputError for one that no frame names."""
-    listed = data.values.get(field) or []
-    if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
-        raise InputError(f"{data.where}: {field} must be a list of names, got {shown(listed)}.")
-    known, found = set(names), []
+    """Return the split of each image, as the file's lists state it; {} if they hold nothing out. An image in no list is
+    for training, but missing here if the file lists those for training. Raises InputError for other names."""
+    known = set(names)
     stated = {PurePosixPath(str(entry["file_path"]).replace("\\", "/")) for entry in data.values["frames"]}
-    for name in listed:
-        if (file := files.find(name)) in known:
-            found.append(str(file))
-        elif PurePosixPath(name.replace("\\", "/")) not in stated:
-            raise InputError(f"{data.where}: {field} names {name[:80]}, none of its {len(names)} frames; remove it.")
-    return found
+    lists: dict[Split, list[str]] = {"train": [], "val": [], "test": []}
+    for split, found in lists.items():
+        field = f"{split}_filenames"
+        listed = data.values.get(field) or []
+        if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
+            raise InputError(f"{data.where}: {field} must be a list of names, got {shown(listed)}.")
+        for name in listed:
+            if (file := files.find(name)) in known:
+                found.append(str(file))
+            elif PurePosixPath(name.replace("\\", "/")) not in stated:
+                raise InputError(f"{data.where}: {field} names {name[:80]}, none of {len(names)} frames; remove it.")
+    if not lists["test"]:  # one list is enough to measure by
+        lists["test"], lists["val"] = lists["val"], []
+    if not lists["test"]:
+        return {}
+    lists["train"] = lists["train"] or names
+    return {name: split for split, found in lists.items() for name in found}
 
 
 # D-NeRF
@@ -191,7 +170,7 @@ def _read_dnerf(folder: Path, image_size: int | None) -> Capture:
     cloud = None if path is None else read_cloud(path)
     if cloud is not None and is_random(cloud):  # other trainers write one, often of 1.3 whatever the scene's size
         cloud = None
-    cameras = folder / "transforms_train.json"
+    cameras = folder / TRAIN
     return Capture(
         frames,
         cloud=cloud,
@@ -211,25 +190,18 @@ def _read_split(folder: Path, split: Split, warnings: list[str]) -> list[Frame]:
             f"{path} does not exist, which a D-NeRF scene needs; if there is one file alone, name it transforms.json, "
             "and every eighth image is held out."
         )
-    read = _read_frames(read_json(path), files, "time")
-    frames = []
-    for index, frame in enumerate(read):
-        if frame is None:
-            continue
-        time = index / max(len(read) - 1, 1) if frame.time is None else frame.time
+    data, frames = read_json(path), []
+    read, count = _read_frames(data, files, "time"), len(data.values["frames"])
+    for index, frame in read.items():
+        time = index / max(count - 1, 1) if frame.time is None else frame.time
         if not 0 <= time <= 1:
             raise InputError(f"{frame.where}: time must lie in [0, 1], got {time:g}; divide by the clip's duration.")
         frames.append(dataclasses.replace(frame, time=time, split=split, label=f"{index:03d}"))
-    warnings += files.left_out(len(read), path)
+    warnings += files.left_out(count, path)
     return frames
 
 
 READERS = (
-    Reader(
-        "D-NeRF",
-        "transforms_train.json and transforms_test.json",
-        lambda folder: any((folder / f"transforms_{split}.json").is_file() for split in ("train", "test")),
-        _read_dnerf,
-    ),
-    Reader("nerfstudio", "transforms.json", lambda folder: (folder / "transforms.json").is_file(), _read_nerfstudio),
+    Reader("D-NeRF", f"{TRAIN} and {TEST}", lambda f: (f / TRAIN).is_file() or (f / TEST).is_file(), _read_dnerf),
+    Reader("nerfstudio", "transforms.json", lambda f: (f / "transforms.json").is_file(), _read_nerfstudio),
 )
