@@ -219,10 +219,13 @@ def _views(frames: Sequence[Frame], size: Size, *, shared: bool) -> list[View]:
             K, taken = (lens.K, lens.size) if lens.is_pinhole else (undistortion.K, stored)
             cameras[key] = Camera(K, frame.T_cam_world, *taken).resized(*size)
         load = partial(_pixels, frame.image, undistortion, stored, size)
+        view = View("", cameras[key], frame.time, str(frame.image), load)
         mask = partial(read_mask, undistortion=undistortion, stored=stored, size=size)
-        ignored = partial(mask, frame.mask, frame.mask_kind) if frame.mask and frame.split == "train" else None
-        moving = partial(mask, frame.moving, "white", above=MOSTLY) if frame.moving else None
-        views.append(View("", cameras[key], frame.time, str(frame.image), load, ignored, moving))
+        if frame.mask is not None and frame.split == "train":
+            view = dataclasses.replace(view, ignored=partial(mask, frame.mask, frame.mask_kind))
+        if frame.moving is not None:
+            view = dataclasses.replace(view, moving=partial(mask, frame.moving, "white", above=MOSTLY))
+        views.append(view)
     return views
 
 

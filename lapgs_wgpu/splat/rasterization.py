@@ -32,9 +32,14 @@ def rasterization(
     tile_size: int | None = None,
     backgrounds: Tensor | None = None,
     render_mode: str = "RGB",
-    *,
+    sparse_grad: bool = False,
+    absgrad: bool = False,
     rasterize_mode: str = "classic",
+    channel_chunk: int = 32,
+    distributed: bool = False,
     camera_model: str = "pinhole",
+    segmented: bool = False,
+    covars: Tensor | None = None,
     **others: Any,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render N Gaussians with C cameras, as gsplat's function of this name (version 1.6); its defaults.
@@ -61,10 +66,15 @@ def rasterization(
         tile_size: changes no result.
         backgrounds: (C, 3).
         render_mode: one of RGB, D (sum of weight times depth), ED (D divided by alpha), RGB+D, RGB+ED.
+        sparse_grad: not supported.
+        absgrad: not supported.
         rasterize_mode: classic or antialiased.
+        channel_chunk: changes no result.
+        distributed: not supported.
         camera_model: pinhole alone is supported.
-        others: further arguments of gsplat's. channel_chunk and segmented change no result; of the others, such as
-            absgrad, covars, distributed and sparse_grad, the defaults alone are supported.
+        segmented: changes no result.
+        covars: not supported.
+        others: further arguments of gsplat's; their defaults alone are supported.
 
     Returns:
         Colors (C, height, width, X), alphas (C, height, width, 1), and a dictionary: batch_ids, camera_ids and
@@ -76,10 +86,11 @@ def rasterization(
         NotImplementedError: an argument asks for what is not supported.
         ValueError: shapes do not match.
     """
-    others |= {"radius_clip": radius_clip, "eps2d": eps2d - CONSTANTS["DILATION"]}
+    zeros = {"radius_clip": radius_clip, "sparse_grad": sparse_grad, "absgrad": absgrad, "distributed": distributed}
+    others |= zeros | {"covars": covars, "eps2d": eps2d - CONSTANTS["DILATION"]}
     others["global_z_order"] = not others.get("global_z_order", True)
     for name, value in others.items():
-        if name not in ("channel_chunk", "segmented") and (isinstance(value, Tensor) or value):
+        if isinstance(value, Tensor) or value:
             raise NotImplementedError(f"rasterization: {name} is not supported but by gsplat's default")
     modes = {"render_mode": (render_mode, _MODES), "rasterize_mode": (rasterize_mode, ("classic", "antialiased"))}
     for name, (value, known) in (modes | {"camera_model": (camera_model, ("pinhole",))}).items():
