@@ -47,7 +47,10 @@ def set_up(
     if scene is not None and parts.field is not None:
         raise InputError("the scene to start from keeps its own field; leave out Parts(field=...).")
     if scene is not None and scene.antialiased != config.antialiased:
-        raise InputError(f"the scene to start from has antialiased = {scene.antialiased}; give the configuration that.")
+        raise InputError(
+            f"the scene to start from is drawn with antialiased = {scene.antialiased}, and the configuration says "
+            f"{config.antialiased}; give the configuration the scene's."
+        )
     if dataset is None:
         config = resolve_data(config, Path("runs"))
         dataset = open_dataset(config)
