@@ -55,7 +55,7 @@ def unpacked(path: Path, image_size: int | None) -> list[ImageFile]:
 
 def frames_folder(path: Path, size: Size) -> Path:
     """The folder for the frames of this (width, height), named by the film, its size and date, and the last two folders
-    that it lies in, without a drive or a share, which would lead out of the cache."""
+    that it lies in. Drives and shares are left out: the folder would not lie in the cache."""
     stat, path = path.stat(), path.resolve()
     caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lapgs_wgpu"
     name = f"{path.stem}-{size[0]}x{size[1]}-{stat.st_size:x}-{stat.st_mtime_ns:x}"
