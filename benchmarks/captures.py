@@ -99,7 +99,8 @@ def draw(folder: Path, cache_gb: float, steps: int, step: float) -> dict[str, fl
     for frame in data.train[:: len(data.times)]:
         frame.load()
     unpacking, after_unpacking = time.perf_counter() - start, megabytes()
-    with closing(GroundTruth(open_device(), torch.zeros(3), int(cache_gb * 1e9))) as truth:
+    backgrounds = dict.fromkeys(data.train, torch.zeros(3))
+    with closing(GroundTruth(open_device(), backgrounds, int(cache_gb * 1e9))) as truth:
         draws = Draws(data.train, torch.Generator().manual_seed(0), truth)
         waits = []
         for _ in range(steps):

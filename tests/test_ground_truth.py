@@ -1,6 +1,7 @@
 """The images that a training compares with: which are kept, how they are laid and marked, and their order."""
 
 import dataclasses
+from collections import defaultdict
 from contextlib import closing
 
 import numpy as np
@@ -11,9 +12,11 @@ from helpers.scenes import front_camera
 from lapgs_wgpu.data import Dataset, View, composite
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.train.ground_truth import AHEAD, Draws, GroundTruth, marked_pixels
+from lapgs_wgpu.train.ground_truth import AHEAD, Draws, GroundTruth, backgrounds_of, marked_pixels
+from lapgs_wgpu.train.presets import load_config
 
 BLACK = torch.zeros(3)
+ON_BLACK = defaultdict(lambda: BLACK)
 
 
 class Source:
@@ -31,7 +34,7 @@ class Source:
 def test_the_most_recently_used_images_stay_on_the_device(device: Device) -> None:
     sources = [Source(level) for level in range(7)]
     huge = Source(9, side=60)
-    with closing(GroundTruth(device, BLACK, 10_000)) as truth:
+    with closing(GroundTruth(device, ON_BLACK, 10_000)) as truth:
         for source in sources[:6]:  # 1600 bytes each: six fit
             assert truth.on_device(source.view) is truth.on_device(source.view)
             assert (truth.on_device(source.view).read() & 255 == source._level).all()
@@ -46,7 +49,7 @@ def test_the_most_recently_used_images_stay_on_the_device(device: Device) -> Non
 
 def test_images_that_are_coming_are_decoded_once(device: Device) -> None:
     sources = [Source(level) for level in range(3)]
-    with closing(GroundTruth(device, BLACK, 0)) as truth:
+    with closing(GroundTruth(device, ON_BLACK, 0)) as truth:
         for _ in range(2):
             truth.prefetch(source.view for source in sources)
         for source in sources:
@@ -63,7 +66,7 @@ def test_a_failure_is_raised_where_the_image_is_needed_and_not_kept(device: Devi
         return np.zeros((4, 5, 3), dtype=np.uint8)
 
     view = View("train_000", front_camera(5, 4), 0.0, "r_000.png", pixels)
-    with closing(GroundTruth(device, BLACK, 1000)) as truth:
+    with closing(GroundTruth(device, ON_BLACK, 1000)) as truth:
         truth.prefetch([view])
         with pytest.raises(InputError, match="r_000"):
             truth.on_device(view)
@@ -74,13 +77,24 @@ def test_a_failure_is_raised_where_the_image_is_needed_and_not_kept(device: Devi
 @pytest.mark.parametrize("color", [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.31, 0.77, 0.123)])
 def test_images_lie_on_their_background(color: tuple[float, ...], dataset: Dataset, device: Device) -> None:
     view = dataset.train[0]
-    with closing(GroundTruth(device, torch.tensor(color), 0)) as truth:
+    with closing(GroundTruth(device, {view: torch.tensor(color)}, 0)) as truth:
         rgba = truth.on_device(view).read().view(np.uint8).reshape(*truth.on_device(view).shape, 4)
         image, left_out = truth.on_host(view)
     assert not left_out.any()
     assert (rgba[..., 3] == 255).all()
     assert (rgba[..., :3] == composite(view.load(), color)).all()
     np.testing.assert_array_equal(image.numpy(), composite(view.load(), color).astype(np.float32) / 255)
+
+
+def test_backgrounds_may_vary_from_view_to_view(dataset: Dataset) -> None:
+    data = load_config("tiny").data
+    white = backgrounds_of(dataset.train, dataclasses.replace(data, background="white"))
+    assert all(white[view].tolist() == [1, 1, 1] for view in dataset.train)
+    varied = [backgrounds_of(dataset.train, dataclasses.replace(data, vary_background=True)) for _ in range(2)]
+    colors = torch.stack([varied[0][view] for view in dataset.train])
+    assert torch.equal(colors, torch.stack(list(varied[1].values())))
+    assert len(colors.unique(dim=0)) == len(dataset.train)
+    assert ((colors >= 0) & (colors <= 1)).all()
 
 
 def test_ignored_pixels_are_marked_and_transparent_ones_count() -> None:
@@ -98,7 +112,7 @@ def test_ignored_pixels_are_marked_and_transparent_ones_count() -> None:
 
 
 def test_every_view_is_drawn_once_an_epoch_and_decoded_ahead(dataset: Dataset, device: Device) -> None:
-    with closing(GroundTruth(device, BLACK, 0)) as truth:
+    with closing(GroundTruth(device, ON_BLACK, 0)) as truth:
         draws = Draws(dataset.train, torch.Generator().manual_seed(3), truth)
         epochs = [[draws.next() for _ in dataset.train] for _ in range(3)]
         assert all(set(epoch) == set(dataset.train) for epoch in epochs)

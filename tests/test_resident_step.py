@@ -47,6 +47,7 @@ KINDS = {
     "no dynamics": {"field__dynamics": "0"},
     "no temporal grids": {"field__temporal_hash": "false"},
     "corrections": {"cameras__refine": "on", "cameras__start": "1", "exposure__enabled": "true"},
+    "backgrounds": {"data__vary_background": "true"},
 }
 
 

@@ -80,7 +80,7 @@ class ExchangeStep:
             now.gaussians,
             learners.camera(view),
             truth.on_device(view),
-            truth.color,
+            truth.backgrounds[view],
             weights,
             scene.device,
             learners.exposure(view),

@@ -5,7 +5,7 @@ The image then stays on the device; the host reads it back where it needs it.
 """
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -17,6 +17,7 @@ from torch import Tensor
 from lapgs_wgpu.data.views import View, composite
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.train.config import BACKGROUND_LEVELS, DataConfig
 
 DECODERS = min(4, os.cpu_count() or 1)  # threads that decode images before they are needed
 AHEAD = 8  # images that are decoded before they are needed
@@ -26,12 +27,12 @@ Mark = tuple[Tensor, list[int]]  # where draws stand: the generator's state, and
 class GroundTruth:
     """The ground truth of training views. The most recently used images stay on the device.
 
-    color: (3,) in [0, 1], the background behind transparent images. max_bytes: of the images that are kept on the
-    device, 4 bytes a pixel. A larger image is returned, but not kept.
+    backgrounds: of each view (3,) in [0, 1], behind its rendering and its transparent pixels. max_bytes: of the images
+    that are kept on the device, 4 bytes a pixel. A larger image is returned, but not kept.
     """
 
-    def __init__(self, device: Device, color: Tensor, max_bytes: int) -> None:
-        self._device, self.color, self._max_bytes = device, color, max_bytes
+    def __init__(self, device: Device, backgrounds: Mapping[View, Tensor], max_bytes: int) -> None:
+        self._device, self.backgrounds, self._max_bytes = device, backgrounds, max_bytes
         self._kept: dict[View, DeviceArray] = {}  # that used last at the end
         self._coming: dict[View, Future[NDArray[np.uint8]]] = {}
         self._threads = ThreadPoolExecutor(DECODERS, thread_name_prefix="decode")
@@ -44,7 +45,7 @@ class GroundTruth:
     def prefetch(self, views: Iterable[View]) -> None:
         """Decode the images that are needed next, in the background; `on_device` raises what goes wrong there."""
         self._coming = {
-            view: self._coming.get(view) or self._threads.submit(marked_pixels, view, self.color)
+            view: self._coming.get(view) or self._threads.submit(marked_pixels, view, self.backgrounds[view])
             for view in views
             if view not in self._kept
         }
@@ -54,7 +55,8 @@ class GroundTruth:
         array = self._kept.pop(view, None)
         if array is None:
             coming = self._coming.pop(view, None)
-            array = upload_rgba(self._device, coming.result() if coming else marked_pixels(view, self.color))
+            pixels = coming.result() if coming else marked_pixels(view, self.backgrounds[view])
+            array = upload_rgba(self._device, pixels)
         if array.buffer.nbytes <= self._max_bytes:
             while self.used_bytes + array.buffer.nbytes > self._max_bytes:
                 del self._kept[next(iter(self._kept))]
@@ -70,6 +72,14 @@ class GroundTruth:
         self._threads.shutdown(cancel_futures=True)
         self._coming.clear()
         self._kept.clear()
+
+
+def backgrounds_of(views: Sequence[View], config: DataConfig) -> dict[View, Tensor]:
+    """The background colors (3,) of training views: the same for all, or random ones."""
+    if not config.vary_background:
+        return dict.fromkeys(views, torch.full((3,), BACKGROUND_LEVELS[config.background]))
+    colors = np.random.default_rng(0).random((len(views), 3), np.float32)
+    return dict(zip(views, torch.from_numpy(colors), strict=True))
 
 
 class Draws:

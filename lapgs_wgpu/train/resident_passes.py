@@ -4,6 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+from torch import Tensor
+
 from lapgs_wgpu.data.views import View
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.kernel import Commands, Kernel, Later, Recording
@@ -16,7 +18,7 @@ from lapgs_wgpu.motion.passes.samples import Samples
 from lapgs_wgpu.splat.drawing import Drawing, GaussianGradients
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterizer_of
-from lapgs_wgpu.train.config import BACKGROUND_LEVELS, LossWeights
+from lapgs_wgpu.train.config import LossWeights
 from lapgs_wgpu.train.fused_loss import image_loss_of
 from lapgs_wgpu.train.ground_truth import Mark
 from lapgs_wgpu.train.learners import Learners
@@ -78,8 +80,7 @@ class ResidentPasses:
         self.guard, self._bad = (self._pool.array(name, (1,), "uint32") for name in ("guard", "bad"))
         self._totals = self._pool.array("totals", (len(TOTALS),))
         self._recordings: dict[tuple[Any, ...], Recording[Recorded]] = {}
-        level = BACKGROUND_LEVELS[config.data.background]
-        self._background, self._checked = (level, level, level), False
+        self._checked = False
         self._dynamics_loss = bool(config.loss.dynamics) and scene.field_config.dynamics_size > 0
         self._task: Task
 
@@ -106,9 +107,10 @@ class ResidentPasses:
         """Density control's statistics, (N, 2)."""
         return self._pool.array("statistics", (len(self._scene), 2))
 
-    def record(self, commands: Commands, task: Task, truth: DeviceArray) -> Recorded:
-        """Record a step. truth: (H, W), of its view."""
-        self._task = task
+    def record(self, commands: Commands, task: Task, truth: DeviceArray, background: Tensor) -> Recorded:
+        """Record a step. truth: (H, W), of its view. background: (3,) in [0, 1]."""
+        red, green, blue = background.tolist()
+        self._task, self._background = task, (red, green, blue)
         self.corrections.begin(task.view, task.scheduled.step)
         self.parameters.begin(task.rates, moving=task.scheduled.moving)
         held = self._losses.held(truth)
@@ -124,7 +126,7 @@ class ResidentPasses:
         self._recordings = {key: each for key, each in self._recordings.items() if each.holds}
         if shape in self._recordings:
             recording = self._recordings[shape]
-            recording.result[0].camera = camera
+            recording.result[0].camera, recording.result[0].background = camera, self._background
             recording.replay(commands)
         else:
             recording = self._recordings[shape] = Recording(commands, lambda: self._record(commands, task, held))

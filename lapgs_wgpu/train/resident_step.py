@@ -131,11 +131,11 @@ class ResidentStep:
             self._passes.seen().write(seen.numpy(force=True))
         self.parameters.push()
         self._passes.corrections.push()
-        truth = self._draws.truth.on_device(task.view)
+        truth, background = self._draws.truth.on_device(task.view), self._draws.truth.backgrounds[task.view]
         self._passes.check_driver(task)
         task.counts = dict(self.parameters.steps)
         with Commands(self._scene.device, whole=True) as commands:
-            task.drawing, told = self._passes.record(commands, task, truth)
+            task.drawing, told = self._passes.record(commands, task, truth, background)
             task.later = Later(commands, told, self._ring)
         task.later.submitted()
         return task

@@ -18,12 +18,12 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.motion.timing import Timing
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.train.camera_refinement import CameraRefinement
-from lapgs_wgpu.train.config import BACKGROUND_LEVELS, Config
+from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.densify import Statistics
 from lapgs_wgpu.train.density_control import DensityControl
 from lapgs_wgpu.train.evaluate import evaluate
 from lapgs_wgpu.train.exchange_step import ExchangeStep
-from lapgs_wgpu.train.ground_truth import Draws, GroundTruth
+from lapgs_wgpu.train.ground_truth import Draws, GroundTruth, backgrounds_of
 from lapgs_wgpu.train.host import step_threads, torch_threads
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.parts import Parts
@@ -94,8 +94,8 @@ class Trainer:
         self.warm_up_steps, self._ramp_steps = start.warm_up_steps, start.ramp_steps
         self._generator = torch.Generator().manual_seed(config.seed)
         config, scene, dataset = self.config, self.scene, self.dataset
-        color = torch.full((3,), BACKGROUND_LEVELS[config.data.background])
-        self._truth = GroundTruth(scene.device, color, int(config.data.cache_gb * 1e9))
+        backgrounds = backgrounds_of(dataset.train, config.data)
+        self._truth = GroundTruth(scene.device, backgrounds, int(config.data.cache_gb * 1e9))
         self._draws = Draws(dataset.train, self._generator, self._truth)
         self._learners = Learners(config, dataset, self.parts, start)
         self._density = DensityControl(self._learners, self._generator)
@@ -242,7 +242,8 @@ class Trainer:
     def _picture(self, view: View, timing: Timing) -> Tensor:
         """The scene's picture (H, W, 3) of a training view, with the corrections of its camera and of its colors."""
         camera, correction = self._learners.camera(view), self.exposure_of(view)
-        image = self.scene.render(camera, view.time, self._truth.color, depth=False, timing=timing).image
+        background = self._truth.backgrounds[view]
+        image = self.scene.render(camera, view.time, background, depth=False, timing=timing).image
         return image if correction is None else image @ correction[:, :3].T + correction[:, 3]
 
     # The state between two steps -------------------------------------------------------------------------------------
