@@ -25,7 +25,7 @@ class DataConfig(Options):
     background: Literal["black", "white"] = option("color behind the Gaussians and behind transparent images")
     cache_gb: float = option("memory limit for the images that are kept on the device, gigabytes")
     undistort: bool = option("resample images of lenses with distortion or skew to those of a pinhole camera", True)
-    vary_background: bool = option("train each image over a random color, so that nothing stays transparent", False)
+    vary_background: bool = option("train each image over a random color, against transparency", False)
     units: Literal["world", "capture"] = option(
         "length unit of rates.means, smoothness.reach, field.bound and field.unit; capture: that of its files",
         "world",

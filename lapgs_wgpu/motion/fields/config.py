@@ -58,7 +58,7 @@ class FieldConfig(Options):
         at_most=16,
     )
     time_scale: float = option(
-        "fraction of the space-time grids' time axis that the clip takes, in its middle", 0.9, above=0, at_most=1
+        "share of the space-time grids' time axis for the clip, in its middle", 0.9, above=0, at_most=1
     )
     temporal_hash: bool = option("use the space-time hash grids (grid4d, laplacian)", True)
     motion: Literal["laplacian", "mlp"] = option(
