@@ -6,7 +6,6 @@ import dataclasses
 import re
 import sys
 import typing
-from collections.abc import Collection
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -19,12 +18,16 @@ from lapgs_wgpu.train_options import parse_options
 
 if typing.TYPE_CHECKING:
     from lapgs_wgpu.data import Dataset
+    from lapgs_wgpu.gpu.device import Device
     from lapgs_wgpu.train.config import Config
     from lapgs_wgpu.train.lpips import Lpips
 
 Table = dict[str, typing.Any]
-EVAL_KEYS = ("data.path", "data.movers", "data.background", "data.cache_gb")  # keys that can be given with --eval
-RESUME_KEYS = ("data.path", "data.masks", "data.cache_gb")  # and with --resume: where the capture is now
+STARTING = ("preset", "field", "ablate", "out", "resume", "overwrite", "view")  # options of a training that begins
+BESIDE = {  # those and the keys that can be given with --eval, and with --resume: where the capture is now
+    "eval": ("data.path", "data.background", "data.cache_gb"),
+    "resume": ("view", "data.path", "data.masks", "data.cache_gb"),
+}
 
 
 def _train(arguments: list[str]) -> None:
@@ -36,6 +39,7 @@ def _train(arguments: list[str]) -> None:
     from lapgs_wgpu.gpu.device import open_device
     from lapgs_wgpu.train.lpips import Lpips
     from lapgs_wgpu.train.run_folder import changes_since, check_run_folder, result_text
+    from lapgs_wgpu.train.setup import open_data
 
     overrides = {key: options[key] for key in config_keys() if key in options}
     lpips = Lpips(Path(options["lpips_weights"])) if options["lpips_weights"] else None
@@ -46,14 +50,9 @@ def _train(arguments: list[str]) -> None:
         live.window.check_window("leave out --view")  # before anything is written or replaced
         watch = live.watch
     if options["eval"]:
-        out = Path(options["eval"])
-        _evaluate(out, options, overrides, lpips)
+        out = _evaluate(options, overrides, lpips)
     elif options["resume"]:
-        out = Path(options["resume"])
-        _check_alone("resume", options, overrides.keys() - RESUME_KEYS, allowed=("view",))
-        config = _config_of(out, overrides)
-        device = open_device(options["device"])
-        config, dataset = _open_data(config, out.parent, out if "data.path" in overrides else None)
+        out, config, dataset, device = _reopen("resume", options, overrides)
         for what, before, now in changes_since(out, config, device, dataset):
             print(f"lapgs-train: {what} was {before} when {out} began and is {now}: bits may differ.", file=sys.stderr)
         run.resume(config, dataset, out, device=device, watch=watch, lpips=lpips)
@@ -67,23 +66,21 @@ def _train(arguments: list[str]) -> None:
         overwrite = options["overwrite"]
         check_run_folder(out, overwrite=overwrite)
         device = open_device(options["device"])
-        config, dataset = _open_data(config, out.parent)
+        config, dataset = open_data(config, out.parent)
         run.train(config, dataset, out, device=device, overwrite=overwrite, watch=watch, lpips=lpips)
     say(result_text(out))
 
 
-def _evaluate(run: Path, options: Table, overrides: Table, lpips: Lpips | None) -> None:
+def _evaluate(options: Table, overrides: Table, lpips: Lpips | None) -> Path:
+    """Do what --eval says. Returns the folder of the run."""
     from lapgs_wgpu.data import load_dataset
-    from lapgs_wgpu.gpu.device import open_device
     from lapgs_wgpu.io.safe_json_toml import read_json
     from lapgs_wgpu.motion.scene import load
     from lapgs_wgpu.run import evaluate_run
 
-    _check_alone("eval", options, overrides.keys() - EVAL_KEYS)
     movers = overrides.pop("data.movers", None)
-    config = _config_of(run, {**overrides, "data.masks": ""})  # masks are for the training alone
-    scene = load(run / "checkpoint.ply", open_device(options["device"]))
-    config, dataset = _open_data(config, run.parent, run if "data.path" in overrides else None)
+    run, config, dataset, device = _reopen("eval", options, overrides)
+    scene = load(run / "checkpoint.ply", device)
     if movers is not None:  # the world's coordinates follow the masks of the run
         given = load_dataset(config.data.path, image_size=config.data.size or None, movers=movers).test
         pairs = zip(dataset.test, given, strict=True)
@@ -96,40 +93,36 @@ def _evaluate(run: Path, options: Table, overrides: Table, lpips: Lpips | None) 
     training: Table = {"steps": done}
     with suppress(ValueError, KeyError, TypeError):  # InputError is a ValueError
         training |= read_json(run / "metrics.json")["training"]
-    evaluate_run(run, scene, dataset, config.data, training, lpips)
+    evaluate_run(run, scene, dataset, config.data.background, training, lpips)
+    return run
 
 
-def _check_alone(option: str, options: Table, keys: Collection[str], allowed: Collection[str] = ()) -> None:
-    """Raises InputError where --resume or --eval was given with an option that starts a training, or with keys."""
-    starting = ("preset", "field", "ablate", "out", "resume", "overwrite", "view")
-    given = [name for name in starting if options[name] and name not in (option, *allowed)]
-    if given := [*given, *sorted(keys)]:
+def _reopen(option: str, options: Table, overrides: Table) -> tuple[Path, Config, Dataset, Device]:
+    """The folder of the run that --resume or --eval names, its configuration, its capture, and the device.
+
+    Raises InputError where they are not there, or the option was given beside one that starts a training, or keys.
+    """
+    from lapgs_wgpu.gpu.device import open_device
+    from lapgs_wgpu.train.run_folder import check_same_data
+    from lapgs_wgpu.train.setup import open_data
+
+    given = [name for name in STARTING if options[name]] + sorted(overrides)
+    if given := [name for name in given if name not in (option, *BESIDE[option])]:
         word = repr(options["preset"]) if given[0] == "preset" else f"--{given[0]}"
         raise InputError(f"--{option} takes the configuration of the run as it is, so {word} cannot be given.")
-
-
-def _config_of(run: Path, overrides: Table) -> Config:
-    """The configuration of a run. Raises InputError where it or the run's capture is gone."""
-    if not (run / "config.toml").is_file():
-        raise InputError(f"{run / 'config.toml'} does not exist; --resume and --eval need the folder of a run.")
-    config = load_config(str(run / "config.toml"), overrides)
+    run = Path(options[option])
+    file = run / "config.toml"
+    if not file.is_file():
+        raise InputError(f"{file} does not exist; --resume and --eval need the folder of a run.")
+    config = load_config(file, overrides if option == "resume" else {**overrides, "data.masks": ""})
     path = config.data.path
     if path != "synthetic" and not Path(path).exists():
-        raise InputError(f"{path}, the capture of {run / 'config.toml'}, does not exist; give --data where it is now.")
-    return config
-
-
-def _open_data(config: Config, parent: Path, run: Path | None = None) -> tuple[Config, Dataset]:
-    """The configuration with its data's folder, and the dataset. parent: folder for the built-in scene. run: whose
-    capture it must be. Raises InputError."""
-    from lapgs_wgpu.train.run_folder import check_same_data
-    from lapgs_wgpu.train.setup import open_dataset, resolve_data
-
-    config = resolve_data(config, parent)
-    dataset = open_dataset(config)
-    if run is not None:
+        raise InputError(f"{path}, the capture of {file}, does not exist; give --data where it is now.")
+    device = open_device(options["device"])
+    config, dataset = open_data(config, run.parent)
+    if "data.path" in overrides:
         check_same_data(run, config.data.path, dataset)
-    return config, dataset
+    return run, config, dataset, device
 
 
 train_command = partial(guarded, "lapgs-train", _train)

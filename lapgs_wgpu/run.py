@@ -22,7 +22,7 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.progress import say
 from lapgs_wgpu.stop_signals import stop_requests
 from lapgs_wgpu.train import run_folder
-from lapgs_wgpu.train.config import Config, DataConfig
+from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.evaluate import evaluate, write_metrics
 from lapgs_wgpu.train.host import keep_freed_memory, return_freed_memory
 from lapgs_wgpu.train.log import Log
@@ -166,7 +166,7 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
             f"stopped after step {done} of {all_steps}; {out / 'checkpoint.ply'} holds it, and {going_on}"
         )
     try:
-        evaluate_run(out, scene, training.dataset, config.data, measured, lpips)
+        evaluate_run(out, scene, training.dataset, config.data.background, measured, lpips)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
             f"stopped after the last step, while the test views were measured; {going_on}"
@@ -220,18 +220,13 @@ def _saved(training: Trainer, out: Path) -> str:
 
 
 def evaluate_run(
-    out: Path,
-    scene: Scene4D,
-    dataset: Dataset,
-    data: DataConfig,
-    training: dict[str, Any],
-    lpips: Lpips | None = None,
+    out: Path, scene: Scene4D, dataset: Dataset, background: str, training: dict[str, Any], lpips: Lpips | None = None
 ) -> None:
-    """Evaluate on the test views (`evaluate`); write metrics.json and eval/ of a run folder. data: says on which
-    background. training: goes into metrics.json as it is."""
+    """Evaluate on the test views (`evaluate`); write metrics.json and eval/ of a run folder. training: goes into
+    metrics.json as it is."""
     folder = out / "eval"
     if folder.is_symlink():
         raise InputError(f"{folder} is a link, and images are written into the run's own folder only; remove it.")
     folder.mkdir(exist_ok=True)
-    metrics = evaluate(scene, dataset.test, data.background, folder, lpips=lpips)
+    metrics = evaluate(scene, dataset.test, background, folder, lpips=lpips)
     write_metrics(out, {**metrics, "training": training})

@@ -12,7 +12,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.progress import duration
 from lapgs_wgpu.train.config import Config, changed
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.setup import open_dataset, start_from_points
+from lapgs_wgpu.train.setup import open_data, start_from_points
 from lapgs_wgpu.train.trainer import Trainer
 
 FILM, MASKS = "a film with masks of what moves", "masks"  # the latter is lapgs-prepare's folder of them
@@ -94,7 +94,7 @@ def plan_training(
         config = load_config(preset, {"data.path": str(folder.resolve()), "exposure.enabled": exposure})
         # No densification beyond twice the initial number, so that the measured step tells of the whole training.
         config = changed(config, {"density.limit": 2 * config.points.count})
-        dataset = open_dataset(config)
+        config, dataset = open_data(config)
         try:
             step = step_seconds(config, dataset, device)
         except DeviceMemoryError:
