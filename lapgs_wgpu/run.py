@@ -5,7 +5,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -140,8 +139,7 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
     with log, stop_requests() as interrupted:
         if training.discovery is not None:
             log.discovered(training.discovery)
-        training.callbacks.append(partial(_after_step, out, log))
-        steps = _steps(training, out, interrupted)
+        steps = _steps(training, out, log, interrupted)
         if watch is not None:
             watch(out / "checkpoint.ply", scene, training.initial_view, steps)
         for _ in steps:
@@ -151,11 +149,11 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
         done, all_steps = training.done, config.schedule.steps
         measured: dict[str, Any] = {"steps": done, "seconds": round(log.seconds, 3)}
         if done == all_steps and (outside := _outside(scene)):
-            log.tell(outside)
+            log.note(outside)
         for name, refinement in (("cameras", training.cameras), ("image_times", training.timing)):
             if refinement is not None:
                 measured[name] = refinement.report()
-                log.tell(refinement.summary())
+                log.note(refinement.summary())
 
     return_freed_memory()
     run_folder.save_state(out, training.state())
@@ -175,25 +173,22 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
     return scene
 
 
-def _after_step(out: Path, log: Log, training: Trainer, result: StepResult) -> None:
-    """Log a step; at their intervals, the PSNR of validation views, or of some training views, and save the state."""
-    log.step(result, len(training.scene))
-    eval_interval, save_interval = training.config.eval.interval, training.config.schedule.save_interval
-    if eval_interval and result.step % eval_interval == 0:
-        start, data = time.perf_counter(), training.dataset
-        name, views = ("val", data.val) if data.val else ("train", spread_views(data.train, TRAINING_VIEWS))
-        psnr = training.psnr(views)
-        log.evaluated(result.step, psnr, name, time.perf_counter() - start)
-    if save_interval and result.step % save_interval == 0 and result.step < result.steps:
-        run_folder.save_state(out, training.state())
-
-
-def _steps(training: Trainer, out: Path, interrupted: threading.Event) -> Iterator[StepResult]:
-    """Take the steps that are left, until `interrupted` is set. An error saves the state in `out`."""
-    last = training.config.schedule.steps
+def _steps(training: Trainer, out: Path, log: Log, interrupted: threading.Event) -> Iterator[StepResult]:
+    """Take the steps that are left, until `interrupted` is set, and log them. At their intervals, measure the PSNR of
+    validation views, or of some training views, and save the state in `out`, as an error does."""
+    config, data = training.config, training.dataset
+    eval_interval, save_interval, last = config.eval.interval, config.schedule.save_interval, config.schedule.steps
+    name, views = ("val", data.val) if data.val else ("train", spread_views(data.train, TRAINING_VIEWS))
     try:
         while training.done < last and not interrupted.is_set():
-            yield training.step()
+            result = training.step()
+            log.step(result, len(training.scene))
+            if eval_interval and result.step % eval_interval == 0:
+                start = time.perf_counter()
+                log.evaluated(result.step, training.psnr(views), name, time.perf_counter() - start)
+            if save_interval and result.step % save_interval == 0 and result.step < last:
+                run_folder.save_state(out, training.state())
+            yield result
     except Exception as error:
         told = _saved(training, out)
         if isinstance(error, DeviceError | NumericalError):
