@@ -5,6 +5,7 @@ The report is public: it names no users, hosts or folders.
 
 import os
 import platform
+import re
 import sys
 from functools import partial
 from importlib import metadata
@@ -48,11 +49,12 @@ def _doctor(arguments: list[str]) -> int:
 def system_lines() -> list[str]:
     """Markdown list of versions, system and environment."""
     packages = ", ".join(f"{name} {_version(name)}" for name in PACKAGES)
-    set_variables = [f"{name}={_file_names(os.environ[name])}" for name in VARIABLES if name in os.environ]
+    folder = re.compile(rf"[^{os.pathsep}]*[/\\]")  # of a path, in a list of them
+    variables = [f"{name}={folder.sub('', os.environ[name])}" for name in VARIABLES if name in os.environ]
     return [
         f"- {packages}",
         f"- {platform.platform()}, Python {platform.python_version()}, {os.cpu_count()} processors",
-        *([f"- {', '.join(set_variables)}"] if set_variables else []),
+        *([f"- {', '.join(variables)}"] if variables else []),
     ]
 
 
@@ -77,11 +79,6 @@ def _version(package: str) -> str:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
         return "missing"
-
-
-def _file_names(paths: str) -> str:
-    """A list of paths without their folders."""
-    return os.pathsep.join(path.replace("\\", "/").rsplit("/", 1)[-1] for path in paths.split(os.pathsep))
 
 
 doctor_command = partial(guarded, "lapgs-doctor", _doctor)
