@@ -1,20 +1,23 @@
-"""The command lapgs-train."""
+"""The command lapgs-train. Its options: a fixed part, and one for each key of the configuration."""
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
+import json
 import re
 import sys
+import textwrap
 import typing
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
-from lapgs_wgpu.command import guarded, print_devices
+from lapgs_wgpu.command import DEVICE_HELP, LIST_DEVICES_HELP, Parser, guarded, print_devices
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.io.dataclass_table import did_you_mean
 from lapgs_wgpu.progress import say
-from lapgs_wgpu.train.presets import config_keys, load_config
-from lapgs_wgpu.train_options import parse_options
+from lapgs_wgpu.train.presets import ABLATIONS, config_keys, load_config, preset_names
 
 if typing.TYPE_CHECKING:
     from lapgs_wgpu.data import Dataset
@@ -28,6 +31,39 @@ BESIDE = {  # those and the keys that can be given with --eval, and with --resum
     "eval": ("data.path", "data.background", "data.cache_gb"),
     "resume": ("view", "data.path", "data.masks", "data.cache_gb"),
 }
+
+# Short names for the keys that are given most often.
+SHORTCUTS = {
+    "data.path": "--data",
+    "schedule.steps": "--steps",
+    "data.cache_gb": "--cache-gb",
+}
+USAGE = "lapgs-train PRESET --data DIR [--out RUN] [--KEY VALUE ...]"
+DESCRIPTION = """\
+Train a 4D Gaussian splatting model of a moving scene on a folder of images, on any Vulkan, Metal or D3D12 adapter.
+
+  lapgs-train demo --data synthetic             built-in scene; takes minutes on a CPU
+  lapgs-train tiny --data DIR                   D-NeRF scene at 200x200 pixels, with settings for a CPU
+  lapgs-train dnerf-400 --data DIR              D-NeRF scene at 400x400 pixels, some hours on two CPU cores
+  lapgs-train dnerf --data DIR --out RUN        D-NeRF scene as in the paper (800x800 pixels)
+  lapgs-train hypernerf --data DIR              Nerfies or HyperNeRF capture; for a CPU: hypernerf-tiny
+  lapgs-train neu3d --data DIR                  several static cameras; for a CPU: neu3d-tiny
+  lapgs-train rig-full --data DIR               calibrated cameras around what moves; for a CPU: rig
+  lapgs-train film-full --data DIR              your own film and its masks/ (lapgs-prepare); for a CPU: film
+  lapgs-train RUN/config.toml --out RUN2        repeat a run
+  lapgs-train --resume RUN                      continue an interrupted training
+  lapgs-train --eval RUN                        evaluate RUN/checkpoint.ply on the test views again
+
+The run folder receives config.toml, log.jsonl, metrics.json, checkpoint.ply (any 3DGS viewer opens it as a static
+scene) and eval/ with images: ground truth | rendering | 4 x error."""
+KEYS = """\
+keys of the configuration [in brackets: values of the preset {preset}]:
+  "World units" are those of the scene after it was moved and scaled into the cube from -1.3 to 1.3; D-NeRF scenes keep
+  their coordinates. "The cameras' extent" is 1.1 times the largest distance of a training camera from their mean. "With
+  discovery" means: if the training starts with motion discovery (discovery.enabled). "The paper" is "Laplacian Analysis
+  Meets Dynamics Modelling". Learning rates (rates, and .rate of others) are Adam's: they change exponentially from
+  .start to .end, which they reach at step .steps; a parameter with the rate 0 does not change."""
+_METAVARS = {int: "INT", float: "FLOAT", str: "TEXT", bool: "true|false"}
 
 
 def _train(arguments: list[str]) -> None:
@@ -123,6 +159,81 @@ def _reopen(option: str, options: Table, overrides: Table) -> tuple[Path, Config
     if "data.path" in overrides:
         check_same_data(run, config.data.path, dataset)
     return run, config, dataset, device
+
+
+def parse_options(arguments: list[str]) -> dict[str, typing.Any]:
+    """Option name -> value; configuration keys by their dotted names, only those that were given. Raises InputError."""
+    presets = preset_names()
+    preset = next((word for word in arguments if word in presets), "dnerf")
+    help_wanted = "-h" in arguments or "--help" in arguments
+    parser = Parser("lapgs-train", DESCRIPTION, usage=USAGE, epilog=keys_help(preset) if help_wanted else None)
+    # fmt: off
+    add = parser.add_argument
+    parts = "; ".join(f"{name} ({text})" for name, (text, _, _) in ABLATIONS.items())
+    add("preset", nargs="?", metavar="PRESET",
+        help=f"preset configuration: {', '.join(presets)} (names with a scene, such as hypernerf-broom, have the "
+        "settings published for that scene), or the path of a .toml file: RUN/config.toml, or your own, which starts "
+        'with base = "dnerf" or another preset, and names what differs')
+    add("--field", metavar="NAME", help="method: static (3DGS, no motion), mlp (deformable 3DGS), hexplane (4D-GS), "
+        "grid4d (Grid4D) or laplacian (the paper's). All but laplacian also turn off the paper's losses (loss.pyramid, "
+        "loss.ncc) and its adaptive split (density.split) [the preset's]")
+    add("--ablate", metavar="PART[,PART]", help=f"turn off parts of the paper's method, comma-separated: {parts}")
+    add("--out", metavar="RUN", help="run folder for all output; must be new or empty, unless --overwrite is given "
+        "[runs/SCENE-PRESET in the current folder; SCENE: name of the capture's folder]")
+    add("--resume", metavar="RUN", help="continue the interrupted training in run folder RUN from its last saved "
+        "state. Can be combined with --view, --device, --lpips-weights, --cache-gb, --data (where the capture is now) "
+        "and --data.masks (where its masks are) only")
+    add("--overwrite", action="store_true", help="replace an existing run in the run folder; other files stay")
+    add("--view", action="store_true", help="watch the training in a window; P pauses it, S takes a single step; the "
+        "training goes on when the window is closed")
+    add("--device", metavar="NAME", help=DEVICE_HELP)
+    add("--list-devices", action="store_true", help=LIST_DEVICES_HELP)
+    add("--eval", metavar="RUN", help="evaluate the finished run in folder RUN again; replaces metrics.json "
+        "and the images in eval/. Can be combined with --data, --data.background, --cache-gb, --device and "
+        "--lpips-weights only")
+    add("--lpips-weights", metavar="FILE", help="also compute LPIPS (VGG) in the evaluation with the weights in FILE, "
+        "a .safetensors file (docs/metrics.md)")
+    # fmt: on
+    for name, kind in config_keys().items():
+        entries = len(typing.get_args(kind)) if typing.get_origin(kind) is tuple else None
+        add(*_words(name), dest=name, nargs=entries, default=argparse.SUPPRESS, help=argparse.SUPPRESS)
+    known, unknown = parser.parse_known_args(arguments)
+    if unknown:
+        word = unknown[0].split("=")[0]
+        options = [name for action in parser._actions for name in action.option_strings]
+        what = f"there is no option {word}" if word.startswith("-") else f"{word!r} is one word too many"
+        raise InputError(f"{what}{did_you_mean(word, options, '; lapgs-train --help lists the options.')}")
+    return vars(known)
+
+
+def keys_help(preset: str) -> str:
+    """The list of the keys of the configuration, those of no section first, with the values of a preset."""
+    config, lines, section = load_config(preset), [KEYS.format(preset=preset)], None
+    for name, kind in sorted(config_keys().items(), key=lambda key: "." in key[0]):
+        *sections, _ = name.split(".")
+        if sections[:1] != section:
+            section = sections[:1]
+            lines.append("")
+        value: typing.Any = config
+        texts = []
+        for part in name.split("."):
+            texts.append(value.__dataclass_fields__[part].metadata.get("help"))
+            value = getattr(value, part)
+        entries = value if isinstance(value, tuple) else (value,)
+        shown = " ".join(entry if isinstance(entry, str) else json.dumps(entry) for entry in entries)
+        kinds = typing.get_args(kind) or (kind,)
+        literal = typing.get_origin(kind) is typing.Literal
+        metavar = "|".join(kinds) if literal else " ".join(_METAVARS[each] for each in kinds)
+        option = f"{', '.join(_words(name))} {metavar}"
+        text = ": ".join(filter(None, texts)) + (f" [{shown}]" if shown else "")
+        first, others = f"  {option:<38}  ", " " * 42
+        lines += textwrap.wrap(text, 120, initial_indent=first, subsequent_indent=others, break_on_hyphens=False)
+    return "\n".join(lines)
+
+
+def _words(name: str) -> list[str]:
+    """What a key is called on the command line."""
+    return [*([SHORTCUTS[name]] if name in SHORTCUTS else []), f"--{name}"]
 
 
 train_command = partial(guarded, "lapgs-train", _train)

@@ -51,7 +51,6 @@ ALLOWED = {
     "prepare_cli": {"errors", "command", "gpu", "prepare", "train", "run", "io.listing"},
     "doctor": {"errors", "command", "gpu", "splat"},
     "doctor_cli": {"errors", "command", "gpu", "doctor"},
-    "train_options": {"errors", "command", "io", "train"},
     "cli": {
         "errors",
         "progress",
@@ -63,7 +62,6 @@ ALLOWED = {
         "io",
         "train",
         "run",
-        "train_options",
         "viewer",
     },
 }

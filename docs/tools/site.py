@@ -10,8 +10,8 @@ from typing import Any
 from mkdocs.structure.files import File, Files
 
 import lapgs_wgpu
+from lapgs_wgpu.cli import keys_help
 from lapgs_wgpu.train.presets import preset_names
-from lapgs_wgpu.train_options import keys_help
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
