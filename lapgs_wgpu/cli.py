@@ -23,7 +23,7 @@ if typing.TYPE_CHECKING:
     from lapgs_wgpu.data import Dataset
     from lapgs_wgpu.gpu.device import Device
     from lapgs_wgpu.train.config import Config
-    from lapgs_wgpu.train.lpips import Lpips
+    from lapgs_wgpu.train.evaluate import Lpips
 
 Table = dict[str, typing.Any]
 STARTING = ("preset", "field", "ablate", "out", "resume", "overwrite", "view")  # options of a training that begins
@@ -33,11 +33,7 @@ BESIDE = {  # those and the keys that can be given with --eval, and with --resum
 }
 
 # Short names for the keys that are given most often.
-SHORTCUTS = {
-    "data.path": "--data",
-    "schedule.steps": "--steps",
-    "data.cache_gb": "--cache-gb",
-}
+SHORTCUTS = {"data.path": ["--data"], "schedule.steps": ["--steps"], "data.cache_gb": ["--cache-gb"]}
 USAGE = "lapgs-train PRESET --data DIR [--out RUN] [--KEY VALUE ...]"
 DESCRIPTION = """\
 Train a 4D Gaussian splatting model of a moving scene on a folder of images, on any Vulkan, Metal or D3D12 adapter.
@@ -73,7 +69,7 @@ def _train(arguments: list[str]) -> None:
     options = parse_options(arguments)
     from lapgs_wgpu import run  # what follows needs torch, which takes seconds to import
     from lapgs_wgpu.gpu.device import open_device
-    from lapgs_wgpu.train.lpips import Lpips
+    from lapgs_wgpu.train.evaluate import Lpips
     from lapgs_wgpu.train.run_folder import changes_since, check_run_folder, result_text
     from lapgs_wgpu.train.setup import open_data
 
@@ -196,7 +192,8 @@ def parse_options(arguments: list[str]) -> dict[str, typing.Any]:
     # fmt: on
     for name, kind in config_keys().items():
         entries = len(typing.get_args(kind)) if typing.get_origin(kind) is tuple else None
-        add(*_words(name), dest=name, nargs=entries, default=argparse.SUPPRESS, help=argparse.SUPPRESS)
+        words = [*SHORTCUTS.get(name, []), f"--{name}"]
+        add(*words, dest=name, nargs=entries, default=argparse.SUPPRESS, help=argparse.SUPPRESS)
     known, unknown = parser.parse_known_args(arguments)
     if unknown:
         word = unknown[0].split("=")[0]
@@ -224,16 +221,11 @@ def keys_help(preset: str) -> str:
         kinds = typing.get_args(kind) or (kind,)
         literal = typing.get_origin(kind) is typing.Literal
         metavar = "|".join(kinds) if literal else " ".join(_METAVARS[each] for each in kinds)
-        option = f"{', '.join(_words(name))} {metavar}"
+        option = f"{', '.join([*SHORTCUTS.get(name, []), f'--{name}'])} {metavar}"
         text = ": ".join(filter(None, texts)) + (f" [{shown}]" if shown else "")
         first, others = f"  {option:<38}  ", " " * 42
         lines += textwrap.wrap(text, 120, initial_indent=first, subsequent_indent=others, break_on_hyphens=False)
     return "\n".join(lines)
-
-
-def _words(name: str) -> list[str]:
-    """What a key is called on the command line."""
-    return [*([SHORTCUTS[name]] if name in SHORTCUTS else []), f"--{name}"]
 
 
 train_command = partial(guarded, "lapgs-train", _train)

@@ -1,11 +1,13 @@
 """A run from start to end: a configuration and a capture become a trained scene in its run folder."""
 
+import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from lapgs_wgpu.data.initial_gaussians import first_points
@@ -19,13 +21,11 @@ from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.progress import say
-from lapgs_wgpu.stop_signals import stop_requests
 from lapgs_wgpu.train import run_folder
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.evaluate import evaluate, write_metrics
+from lapgs_wgpu.train.evaluate import Lpips, evaluate, write_metrics
 from lapgs_wgpu.train.host import keep_freed_memory, return_freed_memory
 from lapgs_wgpu.train.log import Log
-from lapgs_wgpu.train.lpips import Lpips
 from lapgs_wgpu.train.parts import Parts
 from lapgs_wgpu.train.step_result import StepResult
 from lapgs_wgpu.train.trainer import Trainer
@@ -33,6 +33,7 @@ from lapgs_wgpu.train.trainer import Trainer
 PROBES = 2048  # points of the scene that say whether a camera sees it
 TRAINING_VIEWS = 8  # that are measured during the training where there are no validation views
 OUTSIDE = 0.05  # warn if this share of the Gaussians, or more, is outside the encoder's box
+STOP_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")  # Ctrl-C, kill, a terminal that closes, Windows' Ctrl-Break
 
 # Takes over a training's steps, such as a viewer does: called with the checkpoint's path, the scene, where to look at
 # it from, and the steps, of which it takes as many as it likes, each one a step. The rest follows when it returns.
@@ -96,7 +97,8 @@ def resume(
     """Go on with an interrupted training of this configuration and dataset in its run folder, from its last saved
     state, or from the start where it has none. Otherwise as `train`."""
     out = Path(out)
-    if (out / "metrics.json").exists() and not run_folder.has_state(out):  # --eval measures interrupted runs, too
+    measured, unfinished = (out / "metrics.json").exists(), (out / run_folder.STATE).is_file()
+    if measured and not unfinished:  # --eval measures interrupted runs, too
         raise InputError(f"{out} is finished: there is nothing to resume.")
     keep_freed_memory()
     device = device or open_device()
@@ -209,9 +211,38 @@ def _saved(training: Trainer, out: Path) -> str:
             except InputError as error:  # no second trouble instead of the first
                 return f" (and {error})"
             return f"; stopped after step {training.done}, from which lapgs-train --resume {quoted(out)} goes on."
-    if run_folder.has_state(out):
+    if (out / run_folder.STATE).is_file():
         return f"; lapgs-train --resume {quoted(out)} goes on from the state that was saved last."
     return "; nothing was saved yet."
+
+
+@contextmanager
+def stop_requests() -> Iterator[threading.Event]:
+    """An event that these signals set until the block ends, instead of an exception in the middle of a step.
+
+    The second one of a kind raises KeyboardInterrupt, but for SIGHUP: a shell repeats what the system has sent. Where
+    SIGHUP is ignored (as by nohup) it stays so. Outside the main thread, which alone may listen to signals, nothing
+    happens.
+    """
+    hangup = getattr(signal, "SIGHUP", None)
+    requested, seen = threading.Event(), set[int]()
+
+    def take(number: int, frame: FrameType | None) -> None:
+        if number in seen and number != hangup:
+            raise KeyboardInterrupt
+        seen.add(number)
+        requested.set()
+
+    before = {}
+    with suppress(ValueError):
+        for number in (getattr(signal, name) for name in STOP_SIGNALS if hasattr(signal, name)):
+            if number != hangup or signal.getsignal(number) != signal.SIG_IGN:
+                before[number] = signal.signal(number, take)
+    try:
+        yield requested
+    finally:
+        for number, own in before.items():
+            signal.signal(number, own)
 
 
 def evaluate_run(

@@ -35,8 +35,8 @@ class Log(Progress):
         self._file, so_far = _continued(path, done)
         self._recent: deque[StepResult] = deque(maxlen=INTERVAL)
         self._fresh: list[StepResult] = []  # that were not yet asked what they tell
-        self._began = time.perf_counter()
-        self._start = self._began - (so_far or before)
+        self._start = time.perf_counter() - (so_far or before)
+        self._began = self.seconds
         self._times: deque[float] = deque(maxlen=INTERVAL + 1)  # at which steps ended
 
     def __exit__(self, *error: object) -> None:
@@ -48,14 +48,14 @@ class Log(Progress):
 
     @property
     def seconds(self) -> float:
-        """Since the start, motion discovery included."""
+        """Since the start, motion discovery included, evaluations not."""
         return time.perf_counter() - self._start
 
     def step(self, result: StepResult, gaussians: int) -> None:
         """Take in a step that is done (the loss of a skipped one does not count), and the Gaussians after it."""
         step, last = result.step, result.step == self._total
         self._fresh.append(result)
-        self._times.append(time.perf_counter())
+        self._times.append(self.seconds)
         if step % INTERVAL == 0 or last or self.due:
             self._take_in()
         if not self._recent:
@@ -103,7 +103,6 @@ class Log(Progress):
     def evaluated(self, step: int, psnr: float, views: str, seconds: float) -> None:
         """Take in the mean PSNR (dB) of views ("val" or "train") after a step, and how long it took to measure."""
         self._start += seconds
-        self._times = deque((at + seconds for at in self._times), maxlen=self._times.maxlen)
         self._write_line({"step": step, "val_psnr": round(psnr, 4), "val_views": views})
         shown = {"val": "validation", "train": "training"}[views]
         self.note(f"step {step}: {psnr:.2f} dB on the {shown} views")

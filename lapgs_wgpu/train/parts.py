@@ -98,13 +98,8 @@ class Parts:
     ) -> dict[str, Rate]:
         """The learning rate of each group of parameters, by name.
 
-        Args:
-            configured: those of the configuration.
-            gaussians: names of the Gaussians' parameters.
-            groups: names of the field's groups.
-
-        Raises:
-            InputError: a group has no rate, or the name of other parameters, or a rate has no group.
+        configured: those of the configuration. gaussians: names of the Gaussians' parameters. groups: names of the
+        field's. Raises InputError where a group has no rate, or the name of other parameters, or a rate has no group.
         """
         own = {name: rate if isinstance(rate, Rate) else Rate(rate, rate, 1) for name, rate in self.rates.items()}
         rates = {**configured, **own}

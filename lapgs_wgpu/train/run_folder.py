@@ -25,7 +25,7 @@ from lapgs_wgpu.train.host import environment, step_threads
 from lapgs_wgpu.train.presets import write_toml
 
 LOST = 0.8  # share of the moving pixels; where fewer are drawn as they are, that is a warning
-STATE = "state.safetensors"
+STATE = "state.safetensors"  # from which a training goes on; a finished one has none
 # Of a run, and of older versions. config.toml, by which --overwrite knows a run, is replaced at once instead.
 RUN_FILES = ("log.jsonl", "metrics.json", "metrics.csv", "checkpoint.ply", "eval", "tensorboard", STATE)
 
@@ -127,11 +127,6 @@ def save_state(out: Path, state: State) -> None:
     with atomic_write(out / STATE) as file:
         for buffer in pack_tensors(state, {}):
             file.write(buffer)
-
-
-def has_state(out: Path) -> bool:
-    """Whether the folder holds a state, from which a training goes on; a finished one has none."""
-    return (out / STATE).is_file()
 
 
 def load_state(out: Path) -> dict[str, NDArray[Any]] | None:
