@@ -1,7 +1,4 @@
-"""The command lapgs-doctor: a report of the system, its adapters and a self-test, to paste into an issue.
-
-The report is public: it names no users, hosts or folders.
-"""
+"""The command lapgs-doctor: a report of the system, its adapters and a self-test, to paste into an issue."""
 
 import os
 import platform

@@ -53,14 +53,15 @@ class Log(Progress):
 
     def step(self, result: StepResult, gaussians: int) -> None:
         """Take in a step that is done (the loss of a skipped one does not count), and the Gaussians after it."""
-        step, last = result.step, result.step == self._total
+        step = result.step
+        logged = step % INTERVAL == 0 or step == self._total
         self._fresh.append(result)
         self._times.append(self.seconds)
-        if step % INTERVAL == 0 or last or self.due:
+        if logged or self.due:
             self._take_in()
         if not self._recent:
             return
-        if step % INTERVAL == 0 or last:
+        if logged:
             means, rate = self._means(), round(self._steps_per_second(), 3)
             self._write_line({"step": step, **means, "gaussians": gaussians}, steps_per_second=rate)
         self.at(step, lambda: self._progress_line(step, gaussians))

@@ -128,10 +128,8 @@ def torch_loss(term: LossTerm, image: DeviceArray, truth: DeviceArray, weight: f
         value = term.function(shown, torch.where(left_out, shown.detach(), target))
         if not isinstance(value, Tensor) or value.ndim:
             raise InputError(f"the loss {term.name!r} must return a scalar, got {getattr(value, 'shape', value)}.")
-        gradient = torch.zeros_like(shown)
+        d_image = np.zeros((4, *truth.shape), np.float32)
         if value.requires_grad:
-            (found,) = torch.autograd.grad(value, shown, allow_unused=True)
-            gradient = gradient if found is None else found.masked_fill(left_out, 0.0)
-    d_image = np.zeros((4, *truth.shape), np.float32)
-    d_image[:3] = weight * gradient.permute(2, 0, 1).numpy()
+            (gradient,) = torch.autograd.grad(value, shown, materialize_grads=True)
+            d_image[:3] = weight * gradient.masked_fill(left_out, 0.0).permute(2, 0, 1).numpy()
     return float(value.detach()), d_image

@@ -91,10 +91,9 @@ def plan_training(
         layout = FILM
     for preset in PRESETS[layout][1:] if device.is_cpu else PRESETS[layout]:
         last = preset == PRESETS[layout][1]
-        config = load_config(preset, {"data.path": str(folder.resolve()), "exposure.enabled": exposure})
+        config = load_config(preset, {"data.path": str(folder), "exposure.enabled": exposure})
         # No densification beyond twice the initial number, so that the measured step tells of the whole training.
-        config = changed(config, {"density.limit": 2 * config.points.count})
-        config, dataset = open_data(config)
+        config, dataset = open_data(changed(config, {"density.limit": 2 * config.points.count}))
         try:
             step = step_seconds(config, dataset, device)
         except DeviceMemoryError:
