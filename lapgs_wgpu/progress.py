@@ -38,7 +38,10 @@ class Progress:
             line = text() if text else f"{done}/{self._total} {self._what}"
             if not text and done != first:
                 line += f"  {duration((now - since) / (done - first) * (self._total - done))} left"
-            self._write(in_place(line) if self._stream.isatty() else f"{line}\n")
+            width = (
+                shutil.get_terminal_size().columns - 1
+            )  # in place of the last line: older consoles know no escape codes
+            self._write(f"\r{line[:width]:<{width}}" if self._stream.isatty() else f"{line}\n")
 
     @property
     def due(self) -> bool:
@@ -54,7 +57,7 @@ class Progress:
     def clear(self) -> None:
         """Remove the line from a terminal."""
         if self._stream.isatty():
-            self._write(in_place("") + "\r")
+            self._write(f"\r{' ' * (shutil.get_terminal_size().columns - 1)}\r")
 
     def _write(self, text: str) -> None:
         with suppress(OSError):  # a closed pipe or a full disk behind stderr does not stop the job
@@ -68,12 +71,6 @@ def counted(items: Iterable[T], total: int, what: str) -> Iterator[T]:
         for done, item in enumerate(items, 1):
             yield item
             progress.at(done)
-
-
-def in_place(line: str) -> str:
-    """What shows a line in place of the terminal's last one, cut to its width. Older consoles know no escape codes."""
-    width = shutil.get_terminal_size().columns - 1
-    return f"\r{line[:width]:<{width}}"
 
 
 def say(text: str) -> None:

@@ -160,9 +160,8 @@ def _off_path(scene: Scene4D, view: View, color: Tensor) -> NDArray[np.uint8]:
     depth = float((drawn.depth[shown] / drawn.alpha[shown]).median()) if shown.any() else 1.0
     pictures = []
     for way in (OFF_PATH, -OFF_PATH):  # the world moves the other way
-        shift = np.eye(4)
-        shift[0, 3] = way * depth
-        camera = dataclasses.replace(view.camera, T_cam_world=shift @ view.camera.T_cam_world)
+        pose = view.camera.T_cam_world + way * depth * np.eye(4, k=3)
+        camera = dataclasses.replace(view.camera, T_cam_world=pose)
         pictures.append(to_8_bit(scene.render(camera, view.time, color, depth=False).image))
     return np.concatenate(pictures, axis=1)
 
@@ -181,8 +180,7 @@ def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:
 
 def to_8_bit(image: Tensor) -> NDArray[np.uint8]:
     """(H, W, 3) in [0, 1], clamped and rounded to the nearest 8-bit value."""
-    rounded = (image.detach().clamp(0, 1) * 255).round().to(torch.uint8)
-    return rounded.numpy(force=True)
+    return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).numpy(force=True)
 
 
 def side_by_side(truth: NDArray[np.uint8], image: NDArray[np.uint8]) -> NDArray[np.uint8]:

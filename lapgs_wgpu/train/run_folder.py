@@ -122,8 +122,7 @@ def result_text(run: Path) -> str:
 
 
 def save_state(out: Path, state: State) -> None:
-    """Write the state of a training. Raises InputError where the disk does not allow it; the one before is then
-    unchanged."""
+    """Write the state of a training, or leave the one before as it is and raise InputError."""
     with atomic_write(out / STATE) as file:
         for buffer in pack_tensors(state, {}):
             file.write(buffer)
