@@ -38,9 +38,7 @@ class Progress:
             line = text() if text else f"{done}/{self._total} {self._what}"
             if not text and done != first:
                 line += f"  {duration((now - since) / (done - first) * (self._total - done))} left"
-            width = (
-                shutil.get_terminal_size().columns - 1
-            )  # in place of the last line: older consoles know no escape codes
+            width = shutil.get_terminal_size().columns - 1  # older consoles know no escape codes
             self._write(f"\r{line[:width]:<{width}}" if self._stream.isatty() else f"{line}\n")
 
     @property
