@@ -130,10 +130,7 @@ def _evaluate(options: Table, overrides: Table, lpips: Lpips | None) -> Path:
 
 
 def _reopen(option: str, options: Table, overrides: Table) -> tuple[Path, Config, Dataset, Device]:
-    """The folder of the run that --resume or --eval names, its configuration, its capture, and the device.
-
-    Raises InputError where they are not there, or the option was given beside one that starts a training, or keys.
-    """
+    """Folder, configuration, capture and device of the run that --resume or --eval names. Raises InputError."""
     from lapgs_wgpu.gpu.device import open_device
     from lapgs_wgpu.train.run_folder import check_same_data
     from lapgs_wgpu.train.setup import open_data

@@ -162,15 +162,13 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
     training.save(out / "checkpoint.ply")
     going_on = f"lapgs-train --resume {quoted(out)} goes on."
     if done < all_steps:
-        raise KeyboardInterrupt(
-            f"stopped after step {done} of {all_steps}; {out / 'checkpoint.ply'} holds it, and {going_on}"
-        )
+        held = f"{out / 'checkpoint.ply'} holds it"
+        raise KeyboardInterrupt(f"stopped after step {done} of {all_steps}; {held}, and {going_on}")
     try:
         evaluate_run(out, scene, training.dataset, config.data.background, measured, lpips)
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(
-            f"stopped after the last step, while the test views were measured; {going_on}"
-        ) from None
+        stopped = "stopped after the last step, while the test views were measured"
+        raise KeyboardInterrupt(f"{stopped}; {going_on}") from None
     run_folder.drop_states(out)
     return scene
 
@@ -218,11 +216,10 @@ def _saved(training: Trainer, out: Path) -> str:
 
 @contextmanager
 def stop_requests() -> Iterator[threading.Event]:
-    """An event that these signals set until the block ends, instead of an exception in the middle of a step.
+    """An event that STOP_SIGNALS set until the block ends, instead of an exception in the middle of a step.
 
     The second one of a kind raises KeyboardInterrupt, but for SIGHUP: a shell repeats what the system has sent. Where
-    SIGHUP is ignored (as by nohup) it stays so. Outside the main thread, which alone may listen to signals, nothing
-    happens.
+    SIGHUP is ignored (as by nohup) it stays so. Only the main thread may listen to signals; in others nothing happens.
     """
     hangup = getattr(signal, "SIGHUP", None)
     requested, seen = threading.Event(), set[int]()

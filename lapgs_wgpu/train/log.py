@@ -93,8 +93,7 @@ class Log(Progress):
 
     def _progress_line(self, step: int, gaussians: int) -> str:
         psnr, rate = self._means()["psnr"], self._steps_per_second()
-        known = len(self._times) > 1 or step == self._total
-        left = duration((self._total - step) / rate) if known else "?"
+        left = duration((self._total - step) / rate) if len(self._times) > 1 or step == self._total else "?"
         return f"step {step}/{self._total}  {psnr:5.2f} dB  {gaussians} Gaussians  {rate:.1f} steps/s  {left} left"
 
     def discovered(self, summary: str) -> None:

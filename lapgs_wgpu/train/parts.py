@@ -18,10 +18,6 @@ from lapgs_wgpu.train.ground_truth import host_image
 from lapgs_wgpu.train.optimizer import FrequencyOptimizer
 from lapgs_wgpu.train.step_result import StepResult
 
-# Called after each step, with the Trainer, whose state is that of the whole step. An error that it raises ends the call
-# of `Trainer.step`; the step stays done.
-Callback = Callable[[Any, StepResult], object]
-
 
 @dataclass(frozen=True)
 class LossTerm:
@@ -67,7 +63,8 @@ class Parts:
         losses: further terms of the loss.
         density: the rule of density control, called at the steps that the configuration plans for it.
         rates: learning rates by group of parameters: of the field's own groups, and in place of configured ones.
-        callbacks: called after each step, in this order.
+        callbacks: called after each whole step, in this order, with the Trainer and the result. An error that one
+            raises ends the call of `Trainer.step`; the step stays done.
 
     Raises:
         InputError: a loss or a rate is of another kind, or two losses have one name.
@@ -77,7 +74,7 @@ class Parts:
     losses: Sequence[LossTerm] = ()
     density: DensityRule = published_rule
     rates: Mapping[str, Rate | float] = dataclasses.field(default_factory=dict)
-    callbacks: Sequence[Callback] = ()
+    callbacks: Sequence[Callable[[Any, StepResult], object]] = ()
 
     def __post_init__(self) -> None:
         # By the terms of the configuration, and by what stands beside them in the log.

@@ -76,9 +76,8 @@ def plan_training(
     minutes: float | None = None,
     exposure: bool = False,
 ) -> Plan:
-    """Choose the training of a capture: a small preset on a CPU device; on others a large one, where its schedule, or
-    most of it, fits into the time. Its steps are those of its schedule, more where the clip has many times, fewer where
-    the time is short.
+    """Choose the training of a capture: a small preset on a CPU device; on others a large one, where most of its
+    schedule fits into the time. The steps are the schedule's, more for many times, fewer where the time is short.
 
     opened: the capture of the folder, with images of any size. minutes: that the training may take, about; None for the
     whole schedule. exposure: whether to learn a color correction for each image. Raises InputError where the capture is
