@@ -4,6 +4,7 @@ import os
 import platform
 import re
 import sys
+from contextlib import suppress
 from functools import partial
 from importlib import metadata
 
@@ -45,11 +46,14 @@ def _doctor(arguments: list[str]) -> int:
 
 def system_lines() -> list[str]:
     """Markdown list of versions, system and environment."""
-    packages = ", ".join(f"{name} {_version(name)}" for name in PACKAGES)
+    versions = dict.fromkeys(PACKAGES, "missing")
+    for name in PACKAGES:
+        with suppress(metadata.PackageNotFoundError):
+            versions[name] = metadata.version(name)
     folder = re.compile(rf"[^{os.pathsep}]*[/\\]")  # of a path, in a list of them
     variables = [f"{name}={folder.sub('', os.environ[name])}" for name in VARIABLES if name in os.environ]
     return [
-        f"- {packages}",
+        f"- {', '.join(f'{name} {version}' for name, version in versions.items())}",
         f"- {platform.platform()}, Python {platform.python_version()}, {os.cpu_count()} processors",
         *([f"- {', '.join(variables)}"] if variables else []),
     ]
@@ -69,13 +73,6 @@ def adapter_lines() -> list[str]:
         for name, (offered, needed) in adapter.too_small.items():
             lines.append(f"  - **cannot be used**: {name} is {offered}, {needed} is needed")
     return lines
-
-
-def _version(package: str) -> str:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return "missing"
 
 
 doctor_command = partial(guarded, "lapgs-doctor", _doctor)
