@@ -116,7 +116,7 @@ def _read(preset: str, seen: tuple[str, ...] = ()) -> Table:
     if preset.endswith(".toml"):
         if not Path(preset).is_file():
             raise InputError(f"{preset} does not exist; give a preset ({', '.join(preset_names())}) or a .toml file.")
-        table = read_toml(preset)
+        table = read_toml(Path(preset))
         of_a_run = table.pop("record", None) is not None  # which an earlier version may have written
         if of_a_run and (gone := _remove_unknown(table, Config)):
             print(f"note: {preset}: ignores {', '.join(gone)}, which this version does not know.", file=sys.stderr)
