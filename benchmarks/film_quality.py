@@ -20,7 +20,7 @@ from lapgs_wgpu.run import train
 from lapgs_wgpu.train.evaluate import evaluate
 from lapgs_wgpu.train.plan import scale_schedule
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.setup import open_dataset, resolve_data
+from lapgs_wgpu.train.setup import open_data
 
 RATE = 24  # frames a second
 LIMIT = "24000"  # Gaussians
@@ -45,9 +45,8 @@ def main(davis: Path, captures: Path, steps: int, films: list[str]) -> None:
         film, _, seed = name.partition(":")
         capture, run, started = captures / film, captures / "runs" / name, time.perf_counter()
         config = load_config("film", {"data.path": str(capture), "density.limit": LIMIT, "seed": seed or "0"})
-        config = resolve_data(scale_schedule(config, steps), run)
         if not (run / "metrics.json").exists():
-            train(config, open_dataset(config), run, device=device, overwrite=True)
+            train(*open_data(scale_schedule(config, steps)), run, device=device, overwrite=True)
         seconds = time.perf_counter() - started
         scene = load(run / "checkpoint.ply", device)
         true = write_true_masks(davis / "Annotations/480p" / film, capture)

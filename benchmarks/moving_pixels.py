@@ -22,7 +22,7 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS
 from lapgs_wgpu.train.evaluate import to_8_bit
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.setup import open_dataset
+from lapgs_wgpu.train.setup import open_data
 
 THRESHOLD = 16  # levels of 255 in any channel: above the noise of a compressed video
 LEAST_TIMES = 5  # of a camera, for a median
@@ -81,7 +81,7 @@ def _median(images: Sequence[Image]) -> Image:
 def measure_run(run: Path, static_run: Path | None) -> tuple[float, float]:
     """PSNR (dB) of moving and of other pixels, means over the test views that have any; NaN where none has."""
     config, device = load_config(run / "config.toml"), open_device()
-    views = open_dataset(config).test
+    views = open_data(config)[1].test
     color = np.full(3, BACKGROUND_LEVELS[config.data.background], np.float32)
 
     def truth(view: View) -> Image:

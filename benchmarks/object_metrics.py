@@ -38,7 +38,7 @@ from lapgs_wgpu.train.config import BACKGROUND_LEVELS
 from lapgs_wgpu.train.evaluate import to_8_bit
 from lapgs_wgpu.train.image_metrics import psnr_of
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.setup import open_dataset
+from lapgs_wgpu.train.setup import open_data
 
 CONTRAST = 0.5
 REACH = 1.0  # diameters from the true mask within which a silhouette is looked for
@@ -240,7 +240,7 @@ class Figures(NamedTuple):
 def measure_run(run: Path) -> Figures:
     """The figures of a finished run on its test views. Raises InputError."""
     config = load_config(run / "config.toml")
-    dataset, scene = open_dataset(config), load(run / "checkpoint.ply", open_device())
+    (_, dataset), scene = open_data(config), load(run / "checkpoint.ply", open_device())
     color = np.full(3, BACKGROUND_LEVELS[config.data.background], np.float32)
     folder = Path(config.data.path)
     frames: list[ObjectFrame] = []

@@ -26,10 +26,10 @@ from lapgs_wgpu.io.dataclass_table import Options, build_dataclass, checked, opt
 from lapgs_wgpu.io.safe_json_toml import read_json, read_toml
 from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.train.config import Config
-from lapgs_wgpu.train.lpips import Lpips
+from lapgs_wgpu.train.evaluate import Lpips
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.run_folder import has_state
-from lapgs_wgpu.train.setup import open_dataset, resolve_data
+from lapgs_wgpu.train.run_folder import STATE
+from lapgs_wgpu.train.setup import open_data
 
 _NAME = re.compile(r"\w[\w .+=-]*", re.ASCII)  # of a scene or a row: of a folder, and a cell of a Markdown table
 # Columns of the printed table: entry of a result, heading, format.
@@ -223,9 +223,8 @@ def _train(run: Run, data: Path, out: Path, device: Device | None, lpips: Lpips 
     folder = run_folder(out, run)
     path = SYNTHETIC if run.folder == SYNTHETIC else str(data / run.folder)
     config = dataclasses.replace(run.config, data=dataclasses.replace(run.config.data, path=path))
-    config = resolve_data(config, out)
-    dataset = open_dataset(config)
-    if has_state(folder) and _holds(folder, run.config):
+    config, dataset = open_data(config, out)
+    if (folder / STATE).is_file() and _holds(folder, run.config):
         resume(config, dataset, folder, device=device, lpips=lpips)
     else:
         train(config, dataset, folder, device=device, overwrite=True, lpips=lpips)

@@ -43,7 +43,6 @@ _NAMES = {
     "train.step_result": ["StepResult"],
     "train.trainer": ["Trainer"],
 }
-_HOMES = {name: home for home, names in _NAMES.items() for name in names}
 __all__ = [
     "Camera", "Change", "Deformation", "DensityState", "Gaussians", "Parts", "Regularizer", "Rendering", "Scene4D",
     "StepResult", "TorchLoss", "Trainer", "list_devices", "load", "load_config", "load_dataset",
@@ -54,6 +53,7 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name == "__version__":
         return importlib.metadata.version("lapgs-wgpu")
-    if name not in _HOMES:
-        raise AttributeError(f"module 'lapgs_wgpu' has no attribute {name!r}")
-    return getattr(importlib.import_module(f".{_HOMES[name]}", __name__), name)
+    for home, names in _NAMES.items():
+        if name in names:
+            return getattr(importlib.import_module(f".{home}", __name__), name)
+    raise AttributeError(f"module 'lapgs_wgpu' has no attribute {name!r}")

@@ -34,10 +34,9 @@ def guarded(name: str, command: Callable[[list[str]], int | None], arguments: Se
     text = ""
     try:
         code = command(list(sys.argv[1:] if arguments is None else arguments)) or 0
-    except NoAdapterError as error:  # either no adapter at all, or none of the wanted name
-        text, code = str(error), 2 if list_devices() else 3
-    except InputError as error:
-        text, code = str(error), 2
+    except (InputError, NoAdapterError) as error:
+        none = isinstance(error, NoAdapterError) and not list_devices()  # at all, or of the wanted name
+        text, code = str(error), 3 if none else 2
     except (DeviceError, MemoryError) as error:
         text, code = str(error) or "out of memory.", 4
     except RuntimeError as error:

@@ -1,7 +1,4 @@
-"""The self-test of lapgs-doctor: a known image and its gradient, against float64.
-
-It prints a Markdown line a check, whose name comes before it runs: a driver may crash or hang.
-"""
+"""The self-test of lapgs-doctor: a known image and its gradient, against float64."""
 
 import math
 import time
@@ -85,12 +82,12 @@ def relative_error(computed: Tensor, expected: Tensor) -> float:
 
 
 def self_test(name: str | None) -> int:
-    """Run the checks on an adapter (`open_device`). Returns 1 if one failed. Raises NoAdapterError."""
+    """Run and print the checks on an adapter (`open_device`). Returns 1 if one failed. Raises NoAdapterError."""
     device = open_device(name)
     print(f"### Self-test on {device.info.name} ({device.info.backend})\n", flush=True)
     found, passed = errors(device), 0
     for check, allowed in ALLOWED.items():
-        print(f"- {check}: ", end="", flush=True)  # which tells where a driver crashed
+        print(f"- {check}: ", end="", flush=True)  # which tells where a driver crashed or hangs
         start = time.perf_counter()
         try:
             error = next(found)

@@ -1,11 +1,10 @@
-"""The command lapgs-doctor: a report of the system, its adapters and a self-test, to paste into an issue.
-
-The report is public: it names no users, hosts or folders.
-"""
+"""The command lapgs-doctor: a report of the system, its adapters and a self-test, to paste into an issue."""
 
 import os
 import platform
+import re
 import sys
+from contextlib import suppress
 from functools import partial
 from importlib import metadata
 
@@ -47,12 +46,16 @@ def _doctor(arguments: list[str]) -> int:
 
 def system_lines() -> list[str]:
     """Markdown list of versions, system and environment."""
-    packages = ", ".join(f"{name} {_version(name)}" for name in PACKAGES)
-    set_variables = [f"{name}={_file_names(os.environ[name])}" for name in VARIABLES if name in os.environ]
+    versions = dict.fromkeys(PACKAGES, "missing")
+    for name in PACKAGES:
+        with suppress(metadata.PackageNotFoundError):
+            versions[name] = metadata.version(name)
+    folder = re.compile(rf"[^{os.pathsep}]*[/\\]")  # of a path, in a list of them
+    variables = [f"{name}={folder.sub('', os.environ[name])}" for name in VARIABLES if name in os.environ]
     return [
-        f"- {packages}",
+        f"- {', '.join(f'{name} {version}' for name, version in versions.items())}",
         f"- {platform.platform()}, Python {platform.python_version()}, {os.cpu_count()} processors",
-        *([f"- {', '.join(set_variables)}"] if set_variables else []),
+        *([f"- {', '.join(variables)}"] if variables else []),
     ]
 
 
@@ -70,18 +73,6 @@ def adapter_lines() -> list[str]:
         for name, (offered, needed) in adapter.too_small.items():
             lines.append(f"  - **cannot be used**: {name} is {offered}, {needed} is needed")
     return lines
-
-
-def _version(package: str) -> str:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return "missing"
-
-
-def _file_names(paths: str) -> str:
-    """A list of paths without their folders."""
-    return os.pathsep.join(path.replace("\\", "/").rsplit("/", 1)[-1] for path in paths.split(os.pathsep))
 
 
 doctor_command = partial(guarded, "lapgs-doctor", _doctor)

@@ -7,7 +7,7 @@ import os
 import sys
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
 from lapgs_wgpu.command import Parser, beside, guarded
 from lapgs_wgpu.errors import InputError, quoted
@@ -74,8 +74,13 @@ def _prepare(arguments: list[str]) -> None:
         )
     if given.out:
         _convert(given)
+        # In a new process: on macOS, COLMAP's library and torch each bring an OpenMP, and the second one that is loaded
+        # ends the process.
         if given.train and sys.platform == "darwin":
-            _train_anew(capture, given.minutes)
+            minutes = [] if given.minutes is None else ["--minutes", str(given.minutes)]
+            sys.stdout.flush()
+            anew = [sys.executable, "-m", "lapgs_wgpu.prepare_cli", "--check", str(capture), "--train", *minutes]
+            os.execv(sys.executable, anew)
     diagnosis = _measure(capture)
     if given.train:
         _train(capture, run, given.minutes, diagnosis)
@@ -137,15 +142,6 @@ def _train(capture: Path, run: Path, minutes: float | None, diagnosis: Diagnosis
     train(plan.config, plan.dataset, run, device=device)
     print(result_text(run))
     print(f"{beside('lapgs-view')} {quoted(run / 'checkpoint.ply')}")
-
-
-def _train_anew(capture: Path, minutes: float | None) -> NoReturn:
-    """Train in a process that takes the place of this one: on macOS, COLMAP's library and torch each bring an OpenMP of
-    their own, and the second one that is loaded ends the process."""
-    command = [sys.executable, "-m", "lapgs_wgpu.prepare_cli", "--check", str(capture), "--train"]
-    command += ["--minutes", str(minutes)] if minutes is not None else []
-    sys.stdout.flush()
-    os.execv(sys.executable, command)
 
 
 prepare_command = partial(guarded, "lapgs-prepare", _prepare)

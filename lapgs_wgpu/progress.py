@@ -5,7 +5,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from typing import TextIO, TypeVar
+from typing import Self, TextIO, TypeVar
 
 T = TypeVar("T")
 TERMINAL_SECONDS = 0.25  # between two updates of the line on a terminal
@@ -16,26 +16,21 @@ class Progress:
     """A context manager. total: number of steps. what: the steps' name, in the plural. stream: stderr where None."""
 
     def __init__(self, total: int, what: str, stream: TextIO | None = None) -> None:
-        self._total, self._what, self._done = total, what, 0
+        self._total, self._what = total, what
         self._stream = stream or sys.stderr
         self._shown = time.perf_counter()
         self._first: tuple[int, float] | None = None  # step, and when it was done: what comes before it may take long
 
-    def __enter__(self) -> "Progress":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         if self._stream.isatty():
             self._write("\n")
 
-    def step(self) -> None:
-        """One more step is done."""
-        self.at(self._done + 1)
-
     def at(self, done: int, text: Callable[[], str] | None = None) -> None:
         """`done` steps are done. text: makes the line, by default the count and the time left at the mean rate since
         the first call."""
-        self._done = done
         now = time.perf_counter()
         self._first = first, since = self._first or (done, now)
         if done == self._total or self.due:
@@ -43,7 +38,8 @@ class Progress:
             line = text() if text else f"{done}/{self._total} {self._what}"
             if not text and done != first:
                 line += f"  {duration((now - since) / (done - first) * (self._total - done))} left"
-            self._write(in_place(line) if self._stream.isatty() else f"{line}\n")
+            width = shutil.get_terminal_size().columns - 1  # older consoles know no escape codes
+            self._write(f"\r{line[:width]:<{width}}" if self._stream.isatty() else f"{line}\n")
 
     @property
     def due(self) -> bool:
@@ -59,7 +55,7 @@ class Progress:
     def clear(self) -> None:
         """Remove the line from a terminal."""
         if self._stream.isatty():
-            self._write(in_place("") + "\r")
+            self._write(f"\r{' ' * (shutil.get_terminal_size().columns - 1)}\r")
 
     def _write(self, text: str) -> None:
         with suppress(OSError):  # a closed pipe or a full disk behind stderr does not stop the job
@@ -70,15 +66,9 @@ class Progress:
 def counted(items: Iterable[T], total: int, what: str) -> Iterator[T]:
     """The items, each a step of a Progress once it was worked on."""
     with Progress(total, what) as progress:
-        for item in items:
+        for done, item in enumerate(items, 1):
             yield item
-            progress.step()
-
-
-def in_place(line: str) -> str:
-    """What shows a line in place of the terminal's last one, cut to its width. Older consoles know no escape codes."""
-    width = shutil.get_terminal_size().columns - 1
-    return f"\r{line[:width]:<{width}}"
+            progress.at(done)
 
 
 def say(text: str) -> None:

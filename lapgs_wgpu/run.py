@@ -1,12 +1,13 @@
 """A run from start to end: a configuration and a capture become a trained scene in its run folder."""
 
+import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
-from functools import partial
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from lapgs_wgpu.data.initial_gaussians import first_points
@@ -20,13 +21,11 @@ from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.progress import say
-from lapgs_wgpu.stop_signals import stop_requests
 from lapgs_wgpu.train import run_folder
-from lapgs_wgpu.train.config import Config, DataConfig
-from lapgs_wgpu.train.evaluate import evaluate, write_metrics
+from lapgs_wgpu.train.config import Config
+from lapgs_wgpu.train.evaluate import Lpips, evaluate, write_metrics
 from lapgs_wgpu.train.host import keep_freed_memory, return_freed_memory
 from lapgs_wgpu.train.log import Log
-from lapgs_wgpu.train.lpips import Lpips
 from lapgs_wgpu.train.parts import Parts
 from lapgs_wgpu.train.step_result import StepResult
 from lapgs_wgpu.train.trainer import Trainer
@@ -34,6 +33,7 @@ from lapgs_wgpu.train.trainer import Trainer
 PROBES = 2048  # points of the scene that say whether a camera sees it
 TRAINING_VIEWS = 8  # that are measured during the training where there are no validation views
 OUTSIDE = 0.05  # warn if this share of the Gaussians, or more, is outside the encoder's box
+STOP_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")  # Ctrl-C, kill, a terminal that closes, Windows' Ctrl-Break
 
 # Takes over a training's steps, such as a viewer does: called with the checkpoint's path, the scene, where to look at
 # it from, and the steps, of which it takes as many as it likes, each one a step. The rest follows when it returns.
@@ -97,7 +97,8 @@ def resume(
     """Go on with an interrupted training of this configuration and dataset in its run folder, from its last saved
     state, or from the start where it has none. Otherwise as `train`."""
     out = Path(out)
-    if (out / "metrics.json").exists() and not run_folder.has_state(out):  # --eval measures interrupted runs, too
+    measured, unfinished = (out / "metrics.json").exists(), (out / run_folder.STATE).is_file()
+    if measured and not unfinished:  # --eval measures interrupted runs, too
         raise InputError(f"{out} is finished: there is nothing to resume.")
     keep_freed_memory()
     device = device or open_device()
@@ -140,8 +141,7 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
     with log, stop_requests() as interrupted:
         if training.discovery is not None:
             log.discovered(training.discovery)
-        training.callbacks.append(partial(_after_step, out, log))
-        steps = _steps(training, out, interrupted)
+        steps = _steps(training, out, log, interrupted)
         if watch is not None:
             watch(out / "checkpoint.ply", scene, training.initial_view, steps)
         for _ in steps:
@@ -151,49 +151,44 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
         done, all_steps = training.done, config.schedule.steps
         measured: dict[str, Any] = {"steps": done, "seconds": round(log.seconds, 3)}
         if done == all_steps and (outside := _outside(scene)):
-            log.tell(outside)
+            log.note(outside)
         for name, refinement in (("cameras", training.cameras), ("image_times", training.timing)):
             if refinement is not None:
                 measured[name] = refinement.report()
-                log.tell(refinement.summary())
+                log.note(refinement.summary())
 
     return_freed_memory()
     run_folder.save_state(out, training.state())
     training.save(out / "checkpoint.ply")
     going_on = f"lapgs-train --resume {quoted(out)} goes on."
     if done < all_steps:
-        raise KeyboardInterrupt(
-            f"stopped after step {done} of {all_steps}; {out / 'checkpoint.ply'} holds it, and {going_on}"
-        )
+        held = f"{out / 'checkpoint.ply'} holds it"
+        raise KeyboardInterrupt(f"stopped after step {done} of {all_steps}; {held}, and {going_on}")
     try:
-        evaluate_run(out, scene, training.dataset, config.data, measured, lpips)
+        evaluate_run(out, scene, training.dataset, config.data.background, measured, lpips)
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(
-            f"stopped after the last step, while the test views were measured; {going_on}"
-        ) from None
+        stopped = "stopped after the last step, while the test views were measured"
+        raise KeyboardInterrupt(f"{stopped}; {going_on}") from None
     run_folder.drop_states(out)
     return scene
 
 
-def _after_step(out: Path, log: Log, training: Trainer, result: StepResult) -> None:
-    """Log a step; at their intervals, the PSNR of validation views, or of some training views, and save the state."""
-    log.step(result, len(training.scene))
-    eval_interval, save_interval = training.config.eval.interval, training.config.schedule.save_interval
-    if eval_interval and result.step % eval_interval == 0:
-        start, data = time.perf_counter(), training.dataset
-        name, views = ("val", data.val) if data.val else ("train", spread_views(data.train, TRAINING_VIEWS))
-        psnr = training.psnr(views)
-        log.evaluated(result.step, psnr, name, time.perf_counter() - start)
-    if save_interval and result.step % save_interval == 0 and result.step < result.steps:
-        run_folder.save_state(out, training.state())
-
-
-def _steps(training: Trainer, out: Path, interrupted: threading.Event) -> Iterator[StepResult]:
-    """Take the steps that are left, until `interrupted` is set. An error saves the state in `out`."""
-    last = training.config.schedule.steps
+def _steps(training: Trainer, out: Path, log: Log, interrupted: threading.Event) -> Iterator[StepResult]:
+    """Take the steps that are left, until `interrupted` is set, and log them. At their intervals, measure the PSNR of
+    validation views, or of some training views, and save the state in `out`, as an error does."""
+    config, data = training.config, training.dataset
+    eval_interval, save_interval, last = config.eval.interval, config.schedule.save_interval, config.schedule.steps
+    name, views = ("val", data.val) if data.val else ("train", spread_views(data.train, TRAINING_VIEWS))
     try:
         while training.done < last and not interrupted.is_set():
-            yield training.step()
+            result = training.step()
+            log.step(result, len(training.scene))
+            if eval_interval and result.step % eval_interval == 0:
+                start = time.perf_counter()
+                log.evaluated(result.step, training.psnr(views), name, time.perf_counter() - start)
+            if save_interval and result.step % save_interval == 0 and result.step < last:
+                run_folder.save_state(out, training.state())
+            yield result
     except Exception as error:
         told = _saved(training, out)
         if isinstance(error, DeviceError | NumericalError):
@@ -214,24 +209,47 @@ def _saved(training: Trainer, out: Path) -> str:
             except InputError as error:  # no second trouble instead of the first
                 return f" (and {error})"
             return f"; stopped after step {training.done}, from which lapgs-train --resume {quoted(out)} goes on."
-    if run_folder.has_state(out):
+    if (out / run_folder.STATE).is_file():
         return f"; lapgs-train --resume {quoted(out)} goes on from the state that was saved last."
     return "; nothing was saved yet."
 
 
+@contextmanager
+def stop_requests() -> Iterator[threading.Event]:
+    """An event that STOP_SIGNALS set until the block ends, instead of an exception in the middle of a step.
+
+    The second one of a kind raises KeyboardInterrupt, but for SIGHUP: a shell repeats what the system has sent. Where
+    SIGHUP is ignored (as by nohup) it stays so. Only the main thread may listen to signals; in others nothing happens.
+    """
+    hangup = getattr(signal, "SIGHUP", None)
+    requested, seen = threading.Event(), set[int]()
+
+    def take(number: int, frame: FrameType | None) -> None:
+        if number in seen and number != hangup:
+            raise KeyboardInterrupt
+        seen.add(number)
+        requested.set()
+
+    before = {}
+    with suppress(ValueError):
+        for number in (getattr(signal, name) for name in STOP_SIGNALS if hasattr(signal, name)):
+            if number != hangup or signal.getsignal(number) != signal.SIG_IGN:
+                before[number] = signal.signal(number, take)
+    try:
+        yield requested
+    finally:
+        for number, own in before.items():
+            signal.signal(number, own)
+
+
 def evaluate_run(
-    out: Path,
-    scene: Scene4D,
-    dataset: Dataset,
-    data: DataConfig,
-    training: dict[str, Any],
-    lpips: Lpips | None = None,
+    out: Path, scene: Scene4D, dataset: Dataset, background: str, training: dict[str, Any], lpips: Lpips | None = None
 ) -> None:
-    """Evaluate on the test views (`evaluate`); write metrics.json and eval/ of a run folder. data: says on which
-    background. training: goes into metrics.json as it is."""
+    """Evaluate on the test views (`evaluate`); write metrics.json and eval/ of a run folder. training: goes into
+    metrics.json as it is."""
     folder = out / "eval"
     if folder.is_symlink():
         raise InputError(f"{folder} is a link, and images are written into the run's own folder only; remove it.")
     folder.mkdir(exist_ok=True)
-    metrics = evaluate(scene, dataset.test, data.background, folder, lpips=lpips)
+    metrics = evaluate(scene, dataset.test, background, folder, lpips=lpips)
     write_metrics(out, {**metrics, "training": training})

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from lapgs_wgpu.cli import keys_help
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.train.config import Rate
@@ -15,7 +16,6 @@ from lapgs_wgpu.train.presets import (
     preset_names,
     write_toml,
 )
-from lapgs_wgpu.train_options import keys_help
 
 
 def write(path: Path, text: str) -> str:

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 import run_table
 
-from lapgs_wgpu import doctor_cli, prepare_cli, train_options
+from lapgs_wgpu import cli, doctor_cli, prepare_cli
 from lapgs_wgpu.train.presets import config_keys, load_config
 from lapgs_wgpu.viewer import options as view_options
 
@@ -92,7 +92,7 @@ def commands() -> set[str]:
 
 
 def train(words: list[str]) -> None:
-    given = train_options.parse_options(words)
+    given = cli.parse_options(words)
     assert given["preset"] or given["eval"] or given["resume"] or given["list_devices"], "names no preset"
     overrides = {key: given[key] for key in config_keys() if key in given}
     ablate = given["ablate"].split(",") if given["ablate"] else ()

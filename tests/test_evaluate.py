@@ -16,9 +16,8 @@ from lapgs_wgpu.io.safetensors_file import pack_tensors
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.train.evaluate import evaluate, side_by_side, to_8_bit, write_metrics
+from lapgs_wgpu.train.evaluate import BLOCKS, Lpips, evaluate, side_by_side, to_8_bit, write_metrics
 from lapgs_wgpu.train.image_metrics import MS_SSIM_SMALLEST, ms_ssim
-from lapgs_wgpu.train.lpips import BLOCKS, Lpips
 from lapgs_wgpu.train.run_folder import result_text
 
 CAMERA = Camera.looking_at([0, -4, 0], [0, 0, 0], up=[0, 0, 1], fov_x=0.7, width=24, height=16)

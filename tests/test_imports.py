@@ -18,7 +18,6 @@ PACKAGE = Path(lapgs_wgpu.__file__).parent
 ALLOWED = {
     "errors": set(),
     "progress": set(),
-    "stop_signals": set(),
     "gpu": {"errors"},
     "splat": {"errors", "gpu"},
     "motion": {"errors", "gpu", "splat", "io"},
@@ -33,9 +32,9 @@ ALLOWED = {
         "io.ply_elements",
     },
     "io": {"errors", "splat.camera"},
-    "train": {"errors", "progress", "stop_signals", "gpu", "splat", "motion", "data", "io"},
+    "train": {"errors", "progress", "gpu", "splat", "motion", "data", "io"},
     "discovery": {"errors", "progress", "gpu", "splat", "motion", "data", "train"},
-    "run": {"errors", "progress", "stop_signals", "gpu", "motion", "data", "io", "train", "discovery"},
+    "run": {"errors", "progress", "gpu", "motion", "data", "io", "train", "discovery"},
     "command": {"errors", "gpu"},
     "viewer": {"errors", "command", "progress", "gpu", "splat", "motion", "data", "io"},
     "prepare": {
@@ -51,7 +50,6 @@ ALLOWED = {
     "prepare_cli": {"errors", "command", "gpu", "prepare", "train", "run", "io.listing"},
     "doctor": {"errors", "command", "gpu", "splat"},
     "doctor_cli": {"errors", "command", "gpu", "doctor"},
-    "train_options": {"errors", "command", "io", "train"},
     "cli": {
         "errors",
         "progress",
@@ -63,7 +61,6 @@ ALLOWED = {
         "io",
         "train",
         "run",
-        "train_options",
         "viewer",
     },
 }
@@ -98,13 +95,12 @@ def test_every_part_has_a_rule() -> None:
 
 
 def test_the_table_of_layers_says_the_same() -> None:
-    """Of the folders, in docs/architecture.md. All may import `errors`, `progress` and `stop_signals`, a command also
-    `command`."""
+    """Of the folders, in docs/architecture.md. All may import `errors` and `progress`, a command also `command`."""
     text = (Path(__file__).parents[1] / "docs/architecture.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `(\w+)/` \|.*\|(.*)\|$", text, re.MULTILINE)
     table = {part: set(re.findall(r"`([\w.]+)`", cell)) for part, cell in rows}
     folders = {part_of(file) for file in FILES if len(file.parts) > 1} & set(ALLOWED)
-    everywhere = {"errors", "progress", "stop_signals", "command"}
+    everywhere = {"errors", "progress", "command"}
     assert table == {part: ALLOWED[part] - everywhere for part in folders} | {"shaders": set()}
 
 

@@ -75,7 +75,7 @@ def test_many_times_need_more_steps(folder: Path, monkeypatch: pytest.MonkeyPatc
     dataset = load_dataset(folder)
     views = tuple(dataclasses.replace(view, time=i / 500) for i, view in enumerate(dataset.train * 4))
     many = dataclasses.replace(dataset, train=views)
-    monkeypatch.setattr("lapgs_wgpu.train.plan.open_dataset", lambda config: many)
+    monkeypatch.setattr("lapgs_wgpu.train.plan.open_data", lambda config: (config, many))
     assert plan(folder, "cpu", {"small": 0.01}).config.schedule.steps == 20 * 400
 
 

@@ -6,7 +6,7 @@ import threading
 import pytest
 from helpers.interrupts import handled
 
-from lapgs_wgpu.stop_signals import stop_requests
+from lapgs_wgpu.run import stop_requests
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 

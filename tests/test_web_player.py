@@ -31,7 +31,7 @@ from lapgs_wgpu.io.lapgs_file import MAGIC
 from lapgs_wgpu.motion.timing import Timing
 from lapgs_wgpu.run import train
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.setup import open_dataset, resolve_data
+from lapgs_wgpu.train.setup import open_data
 from lapgs_wgpu.viewer import web_page
 from lapgs_wgpu.viewer.camera import ViewCamera
 from lapgs_wgpu.viewer.controls import ORBIT, ZOOM
@@ -117,8 +117,7 @@ def test_a_trained_scene(window: Browser, folder: Path, device: Device) -> None:
     bit decides which is drawn first: that may be seen in a picture, not in many (docs/notes/web.md)."""
     overrides = {} if "LAPGS_SOAK" in os.environ else {"schedule.steps": "200", "discovery.enabled": "false"}
     run = folder / "demo"
-    config = resolve_data(load_config("demo", {"data.path": "synthetic", **overrides}), folder)
-    train(config, open_dataset(config), run, device=device)
+    train(*open_data(load_config("demo", {"data.path": "synthetic", **overrides}), folder), run, device=device)
     loaded = load_scene(run / "checkpoint.ply", lambda: device)
     for ending in ("lapgs", "html"):
         export_compact(loaded, folder / f"demo.{ending}")

@@ -22,7 +22,7 @@ from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.constants import COLOR, MEAN, OPACITY, RADIUS
 from lapgs_wgpu.splat.drawing import Drawing
 from lapgs_wgpu.splat.rasterize import rasterizer_of, upload_gaussians
-from lapgs_wgpu.train.setup import open_dataset, resolve_data, resolve_for_dataset
+from lapgs_wgpu.train.setup import open_data, resolve_for_dataset
 
 Picture = NDArray[np.uint8]
 Floats = NDArray[np.float32]
@@ -194,8 +194,7 @@ def discovery(scenes: Path) -> Picture:
 
     scenes: folder of built-in scenes.
     """
-    given = resolve_data(load_config("demo", {"data.path": "synthetic"}), scenes)
-    dataset = open_dataset(given)
+    given, dataset = open_data(load_config("demo", {"data.path": "synthetic"}), scenes)
     config, device = resolve_for_dataset(given, dataset), open_device()
     meter = Progress(config.discovery.steps, "steps of the static fit", None)
     fit = static_fit(config, dataset, device, meter.at)

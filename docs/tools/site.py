@@ -10,8 +10,8 @@ from typing import Any
 from mkdocs.structure.files import File, Files
 
 import lapgs_wgpu
+from lapgs_wgpu.cli import keys_help
 from lapgs_wgpu.train.presets import preset_names
-from lapgs_wgpu.train_options import keys_help
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -81,6 +81,6 @@ def reference_page() -> str:
     """The public names, by their docstrings."""
     lines = ["# Reference", "", "All public names, made from their docstrings: `from lapgs_wgpu import NAME`.", ""]
     for name in lapgs_wgpu.__all__:
-        home = f"lapgs_wgpu.{lapgs_wgpu._HOMES[name]}.{name}"
-        lines += [f"::: {home}", ""]
+        home = next(home for home, names in lapgs_wgpu._NAMES.items() if name in names)
+        lines += [f"::: lapgs_wgpu.{home}.{name}", ""]
     return "\n".join(lines)

@@ -74,8 +74,7 @@ class ScheduleConfig(Options):
 
 @dataclass(frozen=True)
 class Rate(Options):
-    """A learning rate that goes from start to end exponentially, or in a straight line where one of them is 0, and then
-    stays there."""
+    """A learning rate, exponential from start to end, or in a straight line where one of them is 0; then constant."""
 
     start: float = option("initial value", at_least=0, below=math.inf)
     end: float = option("final value", at_least=0, below=math.inf)

@@ -16,7 +16,7 @@ from lapgs_wgpu.train.step_result import StepResult
 INTERVAL = 50  # steps from one line of log.jsonl to the next, over which loss and PSNR are averaged
 
 
-class Log:
+class Log(Progress):
     """Progress of a training, step by step. A context manager.
 
     docs/metrics.md describes the lines of log.jsonl. Their entry "timing" differs from run to run; all others repeat,
@@ -30,50 +30,47 @@ class Log:
     def __init__(
         self, path: Path, steps: int, *, done: int = 0, before: float = 0.0, terminal: TextIO | None = None
     ) -> None:
-        self._steps = steps
-        self._progress = Progress(steps, "steps", terminal)
+        super().__init__(steps, "steps", terminal)
         self._path = path
         self._file, so_far = _continued(path, done)
         self._recent: deque[StepResult] = deque(maxlen=INTERVAL)
         self._fresh: list[StepResult] = []  # that were not yet asked what they tell
-        self._began = time.perf_counter()
-        self._start = self._began - (so_far or before)
+        self._start = time.perf_counter() - (so_far or before)
+        self._began = self.seconds
         self._times: deque[float] = deque(maxlen=INTERVAL + 1)  # at which steps ended
-
-    def __enter__(self) -> "Log":
-        return self
 
     def __exit__(self, *error: object) -> None:
         if error[0] is not None:
             with suppress(Exception):  # one trouble is enough
                 self._take_in()
-        self._progress.__exit__(*error)
+        super().__exit__(*error)
         self._file.close()
 
     @property
     def seconds(self) -> float:
-        """Since the start, motion discovery included."""
+        """Since the start, motion discovery included, evaluations not."""
         return time.perf_counter() - self._start
 
     def step(self, result: StepResult, gaussians: int) -> None:
         """Take in a step that is done (the loss of a skipped one does not count), and the Gaussians after it."""
-        step, last = result.step, result.step == self._steps
+        step = result.step
+        logged = step % INTERVAL == 0 or step == self._total
         self._fresh.append(result)
-        self._times.append(time.perf_counter())
-        if step % INTERVAL == 0 or last or self._progress.due:
+        self._times.append(self.seconds)
+        if logged or self.due:
             self._take_in()
         if not self._recent:
             return
-        if step % INTERVAL == 0 or last:
+        if logged:
             means, rate = self._means(), round(self._steps_per_second(), 3)
-            self._write({"step": step, **means, "gaussians": gaussians}, steps_per_second=rate)
-        self._progress.at(step, lambda: self._progress_line(step, gaussians))
+            self._write_line({"step": step, **means, "gaussians": gaussians}, steps_per_second=rate)
+        self.at(step, lambda: self._progress_line(step, gaussians))
 
     def _take_in(self) -> None:
         """Ask the last steps what they tell, which waits for those that the device is still doing."""
         for result in self._fresh:
             if result.skipped is not None:
-                self.tell(str(result.skipped))
+                self.note(str(result.skipped))
             if math.isfinite(result.loss) and math.isfinite(result.psnr):
                 self._recent.append(result)
         self._fresh.clear()
@@ -96,23 +93,21 @@ class Log:
 
     def _progress_line(self, step: int, gaussians: int) -> str:
         psnr, rate = self._means()["psnr"], self._steps_per_second()
-        known = len(self._times) > 1 or step == self._steps
-        left = duration((self._steps - step) / rate) if known else "?"
-        return f"step {step}/{self._steps}  {psnr:5.2f} dB  {gaussians} Gaussians  {rate:.1f} steps/s  {left} left"
+        left = duration((self._total - step) / rate) if len(self._times) > 1 or step == self._total else "?"
+        return f"step {step}/{self._total}  {psnr:5.2f} dB  {gaussians} Gaussians  {rate:.1f} steps/s  {left} left"
 
     def discovered(self, summary: str) -> None:
         """Take in what motion discovery found, before the first step."""
-        self._write({"step": 0, "discovery": summary})
+        self._write_line({"step": 0, "discovery": summary})
 
     def evaluated(self, step: int, psnr: float, views: str, seconds: float) -> None:
         """Take in the mean PSNR (dB) of views ("val" or "train") after a step, and how long it took to measure."""
         self._start += seconds
-        self._times = deque((at + seconds for at in self._times), maxlen=self._times.maxlen)
-        self._write({"step": step, "val_psnr": round(psnr, 4), "val_views": views})
+        self._write_line({"step": step, "val_psnr": round(psnr, 4), "val_views": views})
         shown = {"val": "validation", "train": "training"}[views]
-        self.tell(f"step {step}: {psnr:.2f} dB on the {shown} views")
+        self.note(f"step {step}: {psnr:.2f} dB on the {shown} views")
 
-    def _write(self, line: dict[str, Any], **timing: float) -> None:
+    def _write_line(self, line: dict[str, Any], **timing: float) -> None:
         line["timing"] = {"seconds": round(self.seconds, 3), **timing}
         try:
             self._file.write((json.dumps(line) + "\n").encode())
@@ -121,10 +116,6 @@ class Log:
                 f"{self._path}: not written ({error.strerror or error}); free some space or check the disk, then "
                 f"lapgs-train --resume {quoted(self._path.parent)} goes on from the last saved state"
             ) from error
-
-    def tell(self, text: str) -> None:
-        """A line of its own on the terminal."""
-        self._progress.note(text)
 
 
 def _continued(path: Path, done: int) -> tuple[BinaryIO, float]:

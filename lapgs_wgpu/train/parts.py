@@ -18,10 +18,6 @@ from lapgs_wgpu.train.ground_truth import host_image
 from lapgs_wgpu.train.optimizer import FrequencyOptimizer
 from lapgs_wgpu.train.step_result import StepResult
 
-# Called after each step, with the Trainer, whose state is that of the whole step. An error that it raises ends the call
-# of `Trainer.step`; the step stays done.
-Callback = Callable[[Any, StepResult], object]
-
 
 @dataclass(frozen=True)
 class LossTerm:
@@ -67,7 +63,8 @@ class Parts:
         losses: further terms of the loss.
         density: the rule of density control, called at the steps that the configuration plans for it.
         rates: learning rates by group of parameters: of the field's own groups, and in place of configured ones.
-        callbacks: called after each step, in this order.
+        callbacks: called after each whole step, in this order, with the Trainer and the result. An error that one
+            raises ends the call of `Trainer.step`; the step stays done.
 
     Raises:
         InputError: a loss or a rate is of another kind, or two losses have one name.
@@ -77,7 +74,7 @@ class Parts:
     losses: Sequence[LossTerm] = ()
     density: DensityRule = published_rule
     rates: Mapping[str, Rate | float] = dataclasses.field(default_factory=dict)
-    callbacks: Sequence[Callback] = ()
+    callbacks: Sequence[Callable[[Any, StepResult], object]] = ()
 
     def __post_init__(self) -> None:
         # By the terms of the configuration, and by what stands beside them in the log.
@@ -98,13 +95,8 @@ class Parts:
     ) -> dict[str, Rate]:
         """The learning rate of each group of parameters, by name.
 
-        Args:
-            configured: those of the configuration.
-            gaussians: names of the Gaussians' parameters.
-            groups: names of the field's groups.
-
-        Raises:
-            InputError: a group has no rate, or the name of other parameters, or a rate has no group.
+        configured: those of the configuration. gaussians: names of the Gaussians' parameters. groups: names of the
+        field's. Raises InputError where a group has no rate, or the name of other parameters, or a rate has no group.
         """
         own = {name: rate if isinstance(rate, Rate) else Rate(rate, rate, 1) for name, rate in self.rates.items()}
         rates = {**configured, **own}
@@ -133,10 +125,8 @@ def torch_loss(term: LossTerm, image: DeviceArray, truth: DeviceArray, weight: f
         value = term.function(shown, torch.where(left_out, shown.detach(), target))
         if not isinstance(value, Tensor) or value.ndim:
             raise InputError(f"the loss {term.name!r} must return a scalar, got {getattr(value, 'shape', value)}.")
-        gradient = torch.zeros_like(shown)
+        d_image = np.zeros((4, *truth.shape), np.float32)
         if value.requires_grad:
-            (found,) = torch.autograd.grad(value, shown, allow_unused=True)
-            gradient = gradient if found is None else found.masked_fill(left_out, 0.0)
-    d_image = np.zeros((4, *truth.shape), np.float32)
-    d_image[:3] = weight * gradient.permute(2, 0, 1).numpy()
+            (gradient,) = torch.autograd.grad(value, shown, materialize_grads=True)
+            d_image[:3] = weight * gradient.masked_fill(left_out, 0.0).permute(2, 0, 1).numpy()
     return float(value.detach()), d_image

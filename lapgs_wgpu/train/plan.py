@@ -12,7 +12,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.progress import duration
 from lapgs_wgpu.train.config import Config, changed
 from lapgs_wgpu.train.presets import load_config
-from lapgs_wgpu.train.setup import open_dataset, start_from_points
+from lapgs_wgpu.train.setup import open_data, start_from_points
 from lapgs_wgpu.train.trainer import Trainer
 
 FILM, MASKS = "a film with masks of what moves", "masks"  # the latter is lapgs-prepare's folder of them
@@ -76,9 +76,8 @@ def plan_training(
     minutes: float | None = None,
     exposure: bool = False,
 ) -> Plan:
-    """Choose the training of a capture: a small preset on a CPU device; on others a large one, where its schedule, or
-    most of it, fits into the time. Its steps are those of its schedule, more where the clip has many times, fewer where
-    the time is short.
+    """Choose the training of a capture: a small preset on a CPU device; on others a large one, where most of its
+    schedule fits into the time. The steps are the schedule's, more for many times, fewer where the time is short.
 
     opened: the capture of the folder, with images of any size. minutes: that the training may take, about; None for the
     whole schedule. exposure: whether to learn a color correction for each image. Raises InputError where the capture is
@@ -91,10 +90,9 @@ def plan_training(
         layout = FILM
     for preset in PRESETS[layout][1:] if device.is_cpu else PRESETS[layout]:
         last = preset == PRESETS[layout][1]
-        config = load_config(preset, {"data.path": str(folder.resolve()), "exposure.enabled": exposure})
+        config = load_config(preset, {"data.path": str(folder), "exposure.enabled": exposure})
         # No densification beyond twice the initial number, so that the measured step tells of the whole training.
-        config = changed(config, {"density.limit": 2 * config.points.count})
-        dataset = open_dataset(config)
+        config, dataset = open_data(changed(config, {"density.limit": 2 * config.points.count}))
         try:
             step = step_seconds(config, dataset, device)
         except DeviceMemoryError:

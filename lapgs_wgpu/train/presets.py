@@ -114,7 +114,12 @@ def _read(preset: str, seen: tuple[str, ...] = ()) -> Table:
     if preset in seen:
         raise InputError(f"{preset}: its base leads back to itself ({' -> '.join((*seen, preset))}).")
     if preset.endswith(".toml"):
-        table = _read_file(preset)
+        if not Path(preset).is_file():
+            raise InputError(f"{preset} does not exist; give a preset ({', '.join(preset_names())}) or a .toml file.")
+        table = read_toml(Path(preset))
+        of_a_run = table.pop("record", None) is not None  # which an earlier version may have written
+        if of_a_run and (gone := _remove_unknown(table, Config)):
+            print(f"note: {preset}: ignores {', '.join(gone)}, which this version does not know.", file=sys.stderr)
     elif preset in _packaged():
         table = dict(_packaged()[preset])
     else:
@@ -126,17 +131,6 @@ def _read(preset: str, seen: tuple[str, ...] = ()) -> Table:
     if not isinstance(base, str):
         raise InputError(f"{preset}: base must be the name of a preset, got {shown(base)}.")
     return _merge(_read(base, (*seen, preset)), table)
-
-
-def _read_file(path: str) -> Table:
-    """The table of a file. That of a run, which an earlier version may have written, loses keys that are gone."""
-    if not Path(path).is_file():
-        raise InputError(f"{path} does not exist; give a preset ({', '.join(preset_names())}) or a .toml file.")
-    table = read_toml(Path(path))
-    of_a_run = table.pop("record", None) is not None
-    if of_a_run and (gone := _remove_unknown(table, Config)):
-        print(f"note: {path}: ignores {', '.join(gone)}, which this version does not know.", file=sys.stderr)
-    return table
 
 
 @functools.cache

@@ -25,7 +25,7 @@ from lapgs_wgpu.train.host import environment, step_threads
 from lapgs_wgpu.train.presets import write_toml
 
 LOST = 0.8  # share of the moving pixels; where fewer are drawn as they are, that is a warning
-STATE = "state.safetensors"
+STATE = "state.safetensors"  # from which a training goes on; a finished one has none
 # Of a run, and of older versions. config.toml, by which --overwrite knows a run, is replaced at once instead.
 RUN_FILES = ("log.jsonl", "metrics.json", "metrics.csv", "checkpoint.ply", "eval", "tensorboard", STATE)
 
@@ -122,16 +122,10 @@ def result_text(run: Path) -> str:
 
 
 def save_state(out: Path, state: State) -> None:
-    """Write the state of a training. Raises InputError where the disk does not allow it; the one before is then
-    unchanged."""
+    """Write the state of a training, or leave the one before as it is and raise InputError."""
     with atomic_write(out / STATE) as file:
         for buffer in pack_tensors(state, {}):
             file.write(buffer)
-
-
-def has_state(out: Path) -> bool:
-    """Whether the folder holds a state, from which a training goes on; a finished one has none."""
-    return (out / STATE).is_file()
 
 
 def load_state(out: Path) -> dict[str, NDArray[Any]] | None:

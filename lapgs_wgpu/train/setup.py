@@ -52,8 +52,7 @@ def set_up(
             f"{config.antialiased}; give the configuration the scene's."
         )
     if dataset is None:
-        config = resolve_data(config, Path("runs"))
-        dataset = open_dataset(config)
+        config, dataset = open_data(config)
     device = device or open_device()
     if scene is not None:
         config = dataclasses.replace(config, field=scene.field_config)
@@ -66,26 +65,18 @@ def set_up(
     return user_config, resolved, dataset, device
 
 
-def resolve_data(config: Config, scenes: Path) -> Config:
-    """The configuration with the absolute paths of its data. scenes: folder into which the built-in scene is written,
-    unless it is there. Raises InputError."""
-    path, masks = config.data.path, config.data.masks
-    if not path:
-        raise InputError(f"the configuration names no data; give --data DIR (in Python data.path), or {SYNTHETIC}.")
-    folder = write_built_in(scenes / SYNTHETIC) if path == SYNTHETIC else Path(path)
-    return changed(config, {"data.path": str(folder.resolve()), "data.masks": masks and str(Path(masks).resolve())})
-
-
-def open_dataset(config: Config) -> Dataset:
-    """The dataset of a configuration whose path is a folder's. Raises InputError."""
+def open_data(config: Config, scenes: Path = Path("runs")) -> tuple[Config, Dataset]:
+    """The configuration with the absolute paths of its data, and the dataset. scenes: folder into which the built-in
+    scene is written, unless it is there. Raises InputError."""
     data = config.data
-    return load_dataset(
-        data.path,
-        image_size=data.size or None,
-        undistort=data.undistort,
-        masks=data.masks or None,
-        movers=data.movers or None,
-    )
+    if not data.path:
+        raise InputError(f"the configuration names no data; give --data DIR (in Python data.path), or {SYNTHETIC}.")
+    folder = write_built_in(scenes / SYNTHETIC) if data.path == SYNTHETIC else Path(data.path)
+    masks = data.masks and str(Path(data.masks).resolve())
+    config = changed(config, {"data.path": str(folder.resolve()), "data.masks": masks})
+    given = {"masks": masks or None, "movers": data.movers or None}
+    size = data.size or None
+    return config, load_dataset(config.data.path, image_size=size, undistort=data.undistort, **given)
 
 
 def resolve_for_dataset(config: Config, dataset: Dataset) -> Config:
