@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.io.regular_file import PathLike, open_regular
+from lapgs_wgpu.io.safe_json_toml import PathLike, open_regular
 from lapgs_wgpu.io.safetensors_file import Array, Tensors, pack_tensors, unpack_tensors
 
 MAGIC = b"lapgs4d\n"

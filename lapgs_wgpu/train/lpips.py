@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.io.regular_file import open_regular
+from lapgs_wgpu.io.safe_json_toml import open_regular
 from lapgs_wgpu.io.safetensors_file import unpack_tensors
 
 # VGG16's convolutions: number in torchvision's `features`, input and output channels; a tap after the last of each
