@@ -54,10 +54,8 @@ class Panels(ImguiRenderer):
 
     @contextmanager
     def _panel(self, title: str, place: tuple[float, float], flags: int, closable: bool | None = None) -> Iterator[Any]:
-        """A panel, and a note of where it lies. Yields whether it stays open.
-
-        place: on the canvas, shares of its width and height; the panel's own point at these shares lies there.
-        """
+        """A panel, and a note of where it lies. Yields whether it stays open. place: on the canvas, shares of its width
+        and height; the panel's own point at these shares lies there."""
         sides = self.viewport.canvas.get_logical_size()
         corner = tuple(_GAP + share * (side - 2 * _GAP) for share, side in zip(place, sides, strict=True))
         imgui.set_next_window_pos(corner, imgui.Cond_.always, place)

@@ -10,8 +10,7 @@ from lapgs_wgpu.viewer.render_modes import BACKGROUNDS, Mode
 
 @dataclass
 class TrainingControl:
-    """Pauses a training. last: the last finished step, a StepResult. single: steps that still run although it is
-    paused."""
+    """Pauses a training. last: its last StepResult. single: number of steps that still run although it is paused."""
 
     last: Any = None
     paused: bool = False

@@ -38,11 +38,8 @@ def check_imgui() -> None:
 
 
 def run_window(given: Any, device: Callable[[], Device]) -> None:
-    """Show the file in a window, as the options of lapgs-view say, until it is closed.
-
-    Raises InputError where there is no place for it, before the file is read, or the capture lacks the view, and
-    DeviceError where the device is lost or full.
-    """
+    """Show the file in a window, as the options of lapgs-view say, until it is closed. Raises InputError, before the
+    file is read where no window can be opened, and DeviceError where the device is lost or full."""
     check_window("take --backend http to look in a browser (also from another machine), or --screenshot FILE.png")
     scene = given_scene(given, device)
     canvas, loop = make_canvas(f"{scene.path} - lapgs-view", given.size or SIZE)

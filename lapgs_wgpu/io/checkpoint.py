@@ -45,10 +45,7 @@ def write_checkpoint(path: PathLike, still: GaussianSnapshot, tensors: Tensors, 
 
 
 def read_checkpoint(path: PathLike) -> Checkpoint:
-    """Read a checkpoint, or any 3DGS .ply file, which has no tensors.
-
-    Raises InputError when the file is neither, is damaged, or holds NaN or infinity.
-    """
+    """Read a checkpoint, or any 3DGS .ply file, which has no tensors. Raises InputError for any other file."""
     with open_ply(path) as ply:
         if _ELEMENT not in ply.elements:
             still, metadata = read_foreign(ply)

@@ -29,10 +29,8 @@ def lapgs_bytes(path: PathLike) -> bytes | None:
 
 
 def pack_lapgs(tensors: Tensors, metadata: Mapping[str, str]) -> bytes:
-    """The bytes of a compact scene; equal arguments give equal bytes on every machine with the same zlib.
-
-    Raises InputError where a value is NaN or infinite, or where the reader would refuse the size.
-    """
+    """The bytes of a compact scene; equal arguments give equal bytes on every machine with the same zlib. Raises
+    InputError where a value is NaN or infinite, or where the reader would refuse the size."""
     content = b"".join(bytes(part) for part in pack_tensors(tensors, metadata))
     if len(content) > MAX_BYTES:
         raise InputError(f"a compact scene holds at most {MAX_BYTES} bytes, and this one needs {len(content)}")

@@ -24,10 +24,8 @@ _LONG_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]+|"(?:[^"\\\n]|\\.)*"|'[^'\n]*')
 
 @contextmanager
 def open_regular(path: PathLike) -> Iterator[BinaryIO]:
-    """Open a regular file for reading: no pipe, which would block, and no device, which may never end.
-
-    Raises InputError, also for errors of the file system while it is open.
-    """
+    """Open a regular file for reading: no pipe, which would block, and no device, which may never end. Raises
+    InputError, also for errors of the file system while it is open."""
     try:
         if not stat.S_ISREG(os.stat(path).st_mode):
             raise InputError(f"{path}: is not a regular file; give the file itself.")
