@@ -20,7 +20,6 @@ from lapgs_wgpu.errors import DeviceLostError, NumericalError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.playback.torch_playback import TorchPlayback
-from lapgs_wgpu.viewer.cli import _start
 from lapgs_wgpu.viewer.frame import Frame, FrameRenderer, FrameRequest
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 from lapgs_wgpu.viewer.options import parse_options
@@ -100,7 +99,7 @@ def test_the_window_begins_as_the_options_say(device: Device, tmp_path: Path, mo
     trained(device, GRID4D, 100).save(tmp_path / "scene.ply")
     _, app, _ = app_by_the_clock(tmp_path / "scene.ply", device, monkeypatch)
     words = "a.ply --time 0.2 --speed 0.5 --loop bounce --mode depth --fps 12 --background white"
-    _start(parse_options(words.split())[0], app.state)
+    app.state.begin(parse_options(words.split())[0])
     state = app.state
     assert (state.clock.time, state.clock.speed, state.clock.loop, state.clock.fps) == (0.2, 0.5, "bounce", 12.0)
     assert (state.mode, state.background, state.clock.playing) == ("depth", (1.0, 1.0, 1.0), False)

@@ -145,8 +145,7 @@ def test_a_turn_goes_around_while_time_stands(run: Path, tmp_path: Path) -> None
 
 def test_where_cameras_stand_on_one_side_a_turn_swings_between_them() -> None:
     from lapgs_wgpu.io.initial_view import InitialView, captured_arc
-    from lapgs_wgpu.viewer.camera import ViewCamera
-    from lapgs_wgpu.viewer.video import orbit_views
+    from lapgs_wgpu.viewer.camera import ViewCamera, orbit_views
 
     def standing(degrees: float) -> Camera:
         place = [3 * np.cos(np.radians(degrees)), 3 * np.sin(np.radians(degrees)), 1]

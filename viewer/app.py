@@ -12,7 +12,6 @@ from lapgs_wgpu.viewer.view_state import ViewState
 from lapgs_wgpu.viewer.viewport import SETTLED, Viewport
 
 _GUI_DRAWS = 3  # after an event, until the panels have found their sizes and colors
-_LONGEST_STEP = 0.25  # seconds that the clip goes on at once, after the window could not be drawn
 
 
 class App:
@@ -50,8 +49,8 @@ class App:
 
     def _draw_frame(self) -> None:
         state, now = self.state, time.perf_counter()
-        # Time passes between two frames of something that runs, not while the window was idle before it.
-        passed = min(now - self._drawn_at, _LONGEST_STEP) if self._running else 0.0
+        # Time passes between two frames of something that runs, not while the window was idle, or not drawn for long.
+        passed = min(now - self._drawn_at, 0.25) if self._running else 0.0
         self._drawn_at, self._running = now, state.clock.playing
         state.clock.advance(passed)
         self.viewport.draw(now)

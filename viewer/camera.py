@@ -1,6 +1,7 @@
-"""The camera that the mouse and the keys move, and how it becomes the rasterizer's."""
+"""The camera that the mouse and the keys move, how it becomes the rasterizer's, and its way around the focus."""
 
 import math
+from collections.abc import Iterator
 from contextlib import suppress
 
 import numpy as np
@@ -86,3 +87,24 @@ class ViewCamera:
 def _about(axis: Vector, angle: float) -> NDArray[np.float64]:
     """(3, 3) rotation by an angle about a unit axis, right-handed."""
     return rotation_matrix([math.cos(0.5 * angle), *(math.sin(0.5 * angle) * axis)])
+
+
+def orbit_views(
+    start: ViewCamera,
+    size: tuple[int, int],
+    frames: int,
+    time: float | None,
+    arc: tuple[float, float] | None = None,
+) -> Iterator[tuple[Camera, float]]:
+    """Go around the focus once: cameras, and times in the clip. time: fixed, in [0, 1]; None plays the clip once.
+    arc: swing to these degrees clockwise and counterclockwise (`InitialView.arc`) instead of going all around."""
+    turned = 0.0  # radians clockwise
+    for number, passed in enumerate(np.linspace(0, 1, frames).tolist()):
+        angle = 2 * math.pi * (number / frames)
+        if arc is not None:
+            wave = math.sin(angle)
+            angle = math.radians(wave * (arc[0] if wave > 0 else arc[1]))
+        if number:
+            start.orbit(angle - turned, 0.0)
+        turned = angle
+        yield start.camera(*size), passed if time is None else time

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError, optional_module
 from lapgs_wgpu.io.atomic import atomic_write
-from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.motion.playback.linear_pieces import Pieces, linear_pieces
 from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.constants import CONSTANTS
@@ -19,9 +18,6 @@ from lapgs_wgpu.viewer.loaded_scene import LoadedScene, nearest_axis
 from lapgs_wgpu.viewer.moving_files import AXES, SH_RANGE, SampledPlayback, read_4dgs
 from lapgs_wgpu.viewer.plain_opacity import plain_factors
 
-MAX_ERROR = 0.5  # pixels, without --max-error
-_SHADE = 4 / 255  # largest change of opacity and color within a piece
-_OF_LINES = 0.85  # share of the error that straight lines may use up; the rest is for the format's rounding
 _TIME_STEP = 1e-3  # seconds: the library rounds the middles of pieces to it (profile "fine")
 
 
@@ -40,17 +36,21 @@ def export_4dgs(scene: LoadedScene, file: Path, max_error: float) -> Loss:
     pixel = 2 * math.tan(0.5 * camera.fov_y) * camera.distance / scene.initial_view.camera.height  # world units
     with atomic_write(file) as target:  # before minutes of work
         with Progress(1000, "thousandths of the motion") as progress:
-            allowed = _OF_LINES * max_error * pixel
-            pieces = linear_pieces(playback, allowed, _SHADE, lambda share: progress.at(1 + int(998 * share)))
+            allowed = 0.85 * max_error * pixel  # the rest is for the format's rounding
+            shade = 4 / 255  # largest change of opacity and color within a piece
+            pieces = linear_pieces(playback, allowed, shade, lambda share: progress.at(1 + int(998 * share)))
             progress.at(1000)
         if not len(pieces.source):
             raise InputError(f"{scene.path}: holds no Gaussians that can be seen.")
         pieces = pieces._replace(opacities=pieces.opacities * plain_factors(scene)[pieces.source])
+        up = AXES.index(nearest_axis(scene.initial_view.up))
+        ahead = AXES.index(nearest_axis(scene.initial_view.camera.T_cam_world[2, :3] * (np.arange(3) != up % 3)))
+        axes = fourdgs.CoordinateFrame(handedness=1, up_axis=up, forward_axis=ahead)  # right-handed, of no unit
         options = fourdgs.WriteOptions(
             profile="fine",
             library="lapgs_wgpu",
             metadata={"color_space": "linear-rec709-display", "visibility_profile": "box"},
-            provenance=_frame(fourdgs, scene.initial_view),
+            provenance=fourdgs.Provenance(frames=[axes]),
             preserve_source_ids=True,
         )
         fov, position, focus = math.degrees(camera.fov_y), tuple(camera.position), tuple(camera.focus)
@@ -109,11 +109,3 @@ def best_degree(sh: NDArray[np.floating]) -> int:
 def harmonics_bytes(coefficients: NDArray[np.floating]) -> NDArray[np.uint8]:
     """Quantize coefficients to the format's bytes, clipped to its range."""
     return np.rint((coefficients + SH_RANGE) * (255 / (2 * SH_RANGE))).clip(0, 255).astype(np.uint8)
-
-
-def _frame(fourdgs: Any, view: InitialView) -> Any:
-    """Name the axes of the file that are nearest to up and ahead."""
-    up = AXES.index(nearest_axis(view.up))
-    ahead = AXES.index(nearest_axis(view.camera.T_cam_world[2, :3] * (np.arange(3) != up % 3)))
-    frame = fourdgs.CoordinateFrame(handedness=1, up_axis=up, forward_axis=ahead)  # right-handed, of no unit
-    return fourdgs.Provenance(frames=[frame])

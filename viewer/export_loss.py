@@ -13,7 +13,6 @@ from lapgs_wgpu.splat.linear_light import sh_basis
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 
-Floats = NDArray[np.floating]
 Rows = NDArray[np.integer]
 
 
@@ -35,8 +34,7 @@ def measure(
     """Compare four pictures of the captured images' size from around the focus; below 40 dB a loss is seen.
 
     written: the opened file. rows: which of the scene's Gaussians each of its is, where they are not the same.
-    time: of all, in [0, 1]; by default from the clip's start to its end. frames: of a sequence, whose times the
-    pictures have then.
+    time: of all, in [0, 1]; by default from the clip's start to its end, at times of a sequence of so many frames.
     """
     rasterizer, pictures = Rasterizer(scene.playback.device), []
     for camera, t in scene.around(4, time):
@@ -62,7 +60,10 @@ def _reason(scene: LoadedScene, written: Playback, rows: Rows | None, camera: Ca
     away = np.linalg.norm(true["means"] - found["means"], axis=1)
     lengths = np.linalg.norm(true["quats"], axis=1) * np.linalg.norm(found["quats"], axis=1)
     cosine = np.abs((true["quats"] * found["quats"]).sum(axis=1)) / lengths
-    colors = (_colors(true["means"], each["sh"], camera) for each in (true, found))
+    towards = true["means"] - camera.position
+    towards = towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    harmonics = ((sh_basis(towards, int(each["sh"].shape[1] ** 0.5) - 1), each["sh"]) for each in (true, found))
+    colors = (np.maximum(np.einsum("nk,nkc->nc", *each) + CONSTANTS["SH_OFFSET"], 0) for each in harmonics)
     differ = {
         "lie off by more than half their size": away > 0.5 * np.median(true["scales"], axis=1),
         "are turned by more than 0.1 rad": 2 * np.arccos(cosine.clip(0, 1)) > 0.1,
@@ -75,10 +76,3 @@ def _reason(scene: LoadedScene, written: Playback, rows: Rows | None, camera: Ca
     if exact.antialiased and not shown.antialiased:
         reasons.append("the scene is drawn antialiased, which the file does not say")
     return "; ".join(reasons)
-
-
-def _colors(means: Floats, sh: Floats, camera: Camera) -> Floats:
-    """(N, 3) displayed colors of harmonics (N, K, 3) in the directions from a camera."""
-    towards = means - camera.position
-    basis = sh_basis(towards / np.linalg.norm(towards, axis=1, keepdims=True), int(sh.shape[1] ** 0.5) - 1)
-    return np.maximum(np.einsum("nk,nkc->nc", basis, sh) + CONSTANTS["SH_OFFSET"], 0)

@@ -7,27 +7,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lapgs_wgpu.gpu.array import read_all
 from lapgs_wgpu.io.atomic import atomic_write
+from lapgs_wgpu.io.ply_elements import Floats
 from lapgs_wgpu.progress import counted
 from lapgs_wgpu.viewer.export_loss import Loss, measure
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene, direction, nearest_axis
 from lapgs_wgpu.viewer.moving_files import USD_DEGREE, USD_HARMONICS, USD_KIND, SampledPlayback, load_pxr, read_usd
 from lapgs_wgpu.viewer.plain_opacity import plain_factors
 
-Floats = NDArray[np.float32]
 
+def export_usd(scene: LoadedScene, file: Path, frames: int | None = None) -> Loss:
+    """Write Gaussians, and compare what usd-core reads with the scene. Atomic.
 
-def export_usd(scene: LoadedScene, file: Path, frames: int) -> Loss:
-    """Write Gaussians at `frames` times evenly from 0 to 1, and compare what usd-core reads with the scene. Atomic.
-
-    Coordinates are the scene's, below a transform that turns its up axis to z where it is neither y nor z. Values that
-    do not change have one sample.
-    Raises InputError where the file cannot be written, or usd-core is missing.
+    frames: number of times, evenly from 0 to 1; by default those of the clip, at least 61. Coordinates are the scene's,
+    below a transform that turns its up axis to z where it is neither y nor z. Values that do not change have one
+    sample. Raises InputError where the file cannot be written, or usd-core is missing.
     """
     pxr = load_pxr()
+    frames = frames or max(61, scene.clock().frames) if scene.playback.moves else 1
     with atomic_write(file) as target, tempfile.TemporaryDirectory() as folder:
         made = Path(folder) / f"{file.stem}{'.usdc' if file.suffix.lower() == '.usdz' else file.suffix.lower()}"
         stage = pxr.Usd.Stage.CreateNew(str(made))
@@ -58,7 +57,14 @@ def _write(pxr: Any, stage: Any, scene: LoadedScene, frames: int) -> None:
     up, above = (pxr.Gf.Vec3d(*direction(name)) for name in (axis, "y" if axis == "y" else "z"))
     upright = pxr.Gf.Matrix4d().SetRotate(pxr.Gf.Rotation(up, above))
     world.AddTransformOp().Set(upright)
-    _write_camera(pxr, stage, scene, upright)
+    view, distance = scene.camera(), scene.camera().distance
+    pose = np.linalg.inv(view.camera(640, 480).T_cam_world) @ np.diag([1.0, -1, -1, 1])  # USD looks along -z, y is up
+    camera = pxr.Gf.Camera(
+        pxr.Gf.Matrix4d(pose.T) * upright,  # USD multiplies rows
+        clippingRange=pxr.Gf.Range1f(0.01 * distance, 100 * distance),
+    )
+    camera.SetPerspectiveFromAspectRatioAndFieldOfView(640 / 480, math.degrees(view.fov_y), pxr.Gf.Camera.FOVVertical)
+    pxr.UsdGeom.Camera.Define(stage, "/World/Camera").SetFromCamera(camera, pxr.Usd.TimeCode.Default())
     splats = stage.DefinePrim("/World/Splats", USD_KIND)
     pxr.Usd.ColorSpaceAPI.Apply(splats).CreateColorSpaceNameAttr("srgb_rec709_display")
     splats.GetAttribute(USD_DEGREE).Set(scene.playback.at(0.0).sh_degree)
@@ -93,14 +99,3 @@ def _values(scene: LoadedScene, t: float, factors: Floats) -> dict[str, Floats]:
         USD_HARMONICS: sh.reshape(-1, 3),
         "extent": np.stack([(means - reach).min(axis=0), (means + reach).max(axis=0)]),
     }
-
-
-def _write_camera(pxr: Any, stage: Any, scene: LoadedScene, upright: Any) -> None:
-    view, distance = scene.camera(), scene.camera().distance
-    pose = np.linalg.inv(view.camera(640, 480).T_cam_world) @ np.diag([1.0, -1, -1, 1])  # USD looks along -z, y is up
-    camera = pxr.Gf.Camera(
-        pxr.Gf.Matrix4d(pose.T) * upright,  # USD multiplies rows
-        clippingRange=pxr.Gf.Range1f(0.01 * distance, 100 * distance),
-    )
-    camera.SetPerspectiveFromAspectRatioAndFieldOfView(640 / 480, math.degrees(view.fov_y), pxr.Gf.Camera.FOVVertical)
-    pxr.UsdGeom.Camera.Define(stage, "/World/Camera").SetFromCamera(camera, pxr.Usd.TimeCode.Default())

@@ -10,7 +10,6 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from rendercanvas.utils.asyncs import sleep
@@ -24,8 +23,6 @@ from lapgs_wgpu.viewer.loaded_scene import LoadedScene
 from lapgs_wgpu.viewer.view_state import TrainingControl
 
 SHARE = 0.02  # of the time may go into pictures while nobody moves anything
-_ATTENTION = 0.5  # seconds after a move in which the pictures come first
-_PATIENCE = 0.02  # seconds between looks at mouse and keys while the training rests
 
 
 def watch(path: Path, scene: Scene4D, initial_view: InitialView, steps: Iterator[Any]) -> None:
@@ -41,18 +38,19 @@ def watch(path: Path, scene: Scene4D, initial_view: InitialView, steps: Iterator
     interrupt = signal.getsignal(signal.SIGINT)
     failed: list[Exception] = []
 
-    def on_interrupt(signum: int, frame: FrameType | None) -> None:
+    def on_interrupt(*what: Any) -> None:
         training.paused = False  # the training notices after its next step
         if callable(interrupt):
-            interrupt(signum, frame)
+            interrupt(*what)
 
     async def drive() -> None:
         signal.signal(signal.SIGINT, on_interrupt)  # in place of the one of the window's loop
         pictured = 0.0  # when the last picture was asked for
         while True:
-            moving = not state.clock.playing and time.perf_counter() - viewport.moved_at < _ATTENTION
+            # For half a second after a move the pictures come first.
+            moving = not state.clock.playing and time.perf_counter() - viewport.moved_at < 0.5
             if moving or (training.paused and not training.single):
-                await sleep(_PATIENCE)
+                await sleep(0.02)
                 continue
             try:
                 training.last = next(steps)

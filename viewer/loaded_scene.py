@@ -1,17 +1,16 @@
 """An opened file: its scene, ready to be shown, and where a viewer begins."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lapgs_wgpu import data
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView
@@ -19,16 +18,10 @@ from lapgs_wgpu.io.safe_json_toml import read_toml
 from lapgs_wgpu.motion.playback.playback import Playback, playback_of
 from lapgs_wgpu.motion.scene_file import SceneFile, read_scene
 from lapgs_wgpu.splat.camera import Camera
-from lapgs_wgpu.viewer.camera import ViewCamera
+from lapgs_wgpu.viewer.camera import ViewCamera, orbit_views
 from lapgs_wgpu.viewer.clock import Clock
 from lapgs_wgpu.viewer.moving_files import MANIFEST, SampledPlayback, open_moving
 from lapgs_wgpu.viewer.render_modes import AHEAD, BACKGROUNDS
-from lapgs_wgpu.viewer.video import TimedCamera, orbit_views
-
-if TYPE_CHECKING:
-    from lapgs_wgpu.data import View
-
-_ELEVATION = math.radians(35)  # of the guessed camera above the middle
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -45,7 +38,7 @@ class LoadedScene:
         """Make a camera where the viewer begins."""
         return ViewCamera(self.initial_view.camera, self.initial_view.focus, self.initial_view.up)
 
-    def around(self, count: int, time: float | None) -> Iterator[TimedCamera]:
+    def around(self, count: int, time: float | None) -> Iterator[tuple[Camera, float]]:
         """Cameras around the focus, in the size of the captured images; time as of `orbit_views`."""
         captured = self.initial_view.camera
         return orbit_views(self.camera(), (captured.width, captured.height), count, time, self.initial_view.arc)
@@ -56,18 +49,16 @@ class LoadedScene:
         return Clock(self.initial_view.frames if self.playback.moves else 1, fps=fps)
 
     @cached_property
-    def views(self) -> tuple[View, ...]:
+    def views(self) -> tuple[data.View, ...]:
         """The views of the capture that the config.toml beside a checkpoint names, those held out first; none where the
         scene is of no run, or the capture is not here."""
-        from lapgs_wgpu.data import load_dataset  # not before the first picture
-
         try:
-            data = read_toml(self.path.parent / "config.toml")["data"]
-            dataset = load_dataset(
-                Path(data["path"]),
-                image_size=int(data["size"]) or None,
-                undistort=bool(data.get("undistort", True)),
-                movers=data.get("movers") or None,  # which tell where the scene lies
+            given = read_toml(self.path.parent / "config.toml")["data"]
+            dataset = data.load_dataset(
+                Path(given["path"]),
+                image_size=int(given["size"]) or None,
+                undistort=bool(given.get("undistort", True)),
+                movers=given.get("movers") or None,  # which tell where the scene lies
             )
         except (OSError, ValueError, KeyError, TypeError, OverflowError):  # InputError is a ValueError
             return ()
@@ -115,6 +106,15 @@ def load_scene(
     return LoadedScene(path, playback, view._replace(frames=frames or (stored or view).frames), file)
 
 
+def given_scene(given: Any, device: Callable[[], Device]) -> LoadedScene:
+    """Open the file as the options of lapgs-view say. Raises InputError, also where a mode has nothing to show."""
+    antialiased = {"yes": True, "no": False}.get(given.antialiased)
+    scene = load_scene(Path(given.file), device, up=given.up, antialiased=antialiased)
+    if given.mode == "motion" and not scene.playback.moves:
+        raise InputError(f"{scene.path}: does not move; --mode motion shows nothing.")
+    return scene
+
+
 def guess_view(playback: Playback, axis: str | None = None) -> InitialView:
     """Guess a view of files that name no camera: the middle of the Gaussians, from where most of them are seen.
 
@@ -130,7 +130,8 @@ def guess_view(playback: Playback, axis: str | None = None) -> InitialView:
     if axis not in AHEAD:
         axis = "z" if extent[2] < 0.5 * min(extent[0], extent[1]) else "-y"
     up, ahead = direction(axis), direction(AHEAD[axis])
-    away = math.sin(_ELEVATION) * up - math.cos(_ELEVATION) * ahead
+    elevation = math.radians(35)  # above the middle
+    away = math.sin(elevation) * up - math.cos(elevation) * ahead
     camera = Camera.looking_at(middle + 3.6 * radius * away, middle, up=up.tolist(), fov_x=0.9, width=640, height=480)
     return InitialView(camera, middle, up, frames=150)
 

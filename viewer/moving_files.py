@@ -19,7 +19,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.io.ply import GaussianSnapshot, vertex_of
-from lapgs_wgpu.io.ply_elements import open_ply
+from lapgs_wgpu.io.ply_elements import Floats, open_ply
 from lapgs_wgpu.io.safe_json_toml import parse_json, read_json
 from lapgs_wgpu.motion.playback.playback import activate, opacity_logits
 from lapgs_wgpu.motion.scene_file import SceneFile, read_scene
@@ -29,7 +29,6 @@ from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.linear_light import display_harmonics
 from lapgs_wgpu.viewer.options import USD
 
-Floats = NDArray[np.float32]
 MANIFEST = "sequence.json"
 SH_RANGE = 4.0  # of .4dgs: a coefficient is a byte from -this to +this (section 6.5 of the specification)
 USD_KIND = "ParticleField3DGaussianSplat"

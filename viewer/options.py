@@ -49,19 +49,23 @@ _TAKES = {
     "--export FILE.usd": {"frames", "up", "antialiased", "overwrite"},
     "--export DIR": {"frames", "up", "antialiased", "overwrite"},
 }
+SIZE = (1280, 720)  # of a window or picture, where nothing else says it
 USD = (".usd", ".usda", ".usdc", ".usdz")
 _JOBS = ("list_devices", "screenshot", "video", "export")
 
 
 def parse_options(arguments: Sequence[str]) -> tuple[Any, str]:
-    """Parse the command line: the options, None where not given, and the job: one of _JOBS, or window. Raises
+    """Parse the command line: the options, None where not given, and the job: one of _JOBS, or the backend. Raises
     InputError where options do not go together; none is silently ignored."""
     given = _parse(arguments)
     jobs = [name for name in _JOBS if getattr(given, name) is not None]
     if len(jobs) > 1:
         raise InputError(f"{_option(jobs[0])} and {_option(jobs[1])} do not go together: one at a time.")
-    job = jobs[0] if jobs else "window"
-    place = _option(job) if jobs else "--backend http" if given.backend == "http" else "a window"
+    job = jobs[0] if jobs else given.backend or "glfw"
+    for name, ending in (("screenshot", ".png"), ("video", ".mp4")):
+        if job == name and not getattr(given, name).lower().endswith(ending):
+            raise InputError(f"--{name} {getattr(given, name)}: expected a name that ends with {ending}.")
+    place = {"http": "--backend http", "glfw": "a window"}.get(job, _option(job))
     if job == "export":
         ending = PurePath(given.export).suffix.lower()
         ending = ".usd" if ending in USD else ending

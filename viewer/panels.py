@@ -33,7 +33,14 @@ class Panels(ImguiRenderer):
         self.set_gui(self._draw)
         imgui.get_io().set_ini_filename("")
         imgui.get_io().config_flags &= ~imgui.ConfigFlags_.nav_enable_keyboard  # the keys are the viewer's
-        _style()
+        style = imgui.get_style()
+        style.window_rounding, style.frame_rounding, style.grab_rounding = 6.0, 4.0, 4.0
+        style.window_border_size = 0.0
+        style.grab_min_size = 14.0
+        style.hover_flags_for_tooltip_mouse = imgui.HoveredFlags_.allow_when_disabled  # at once
+        style.set_color_(imgui.Col_.window_bg, (0.08, 0.08, 0.09, 0.85))
+        style.set_color_(imgui.Col_.slider_grab, _ACCENT)
+        style.set_color_(imgui.Col_.slider_grab_active, _ACCENT)
 
     def _on_mouse(self, event: dict[str, Any]) -> None:
         """A button goes down where its event says: a finger is there without a move."""
@@ -47,10 +54,8 @@ class Panels(ImguiRenderer):
 
     @contextmanager
     def _panel(self, title: str, place: tuple[float, float], flags: int, closable: bool | None = None) -> Iterator[Any]:
-        """A panel, and a note of where it lies. Yields whether it stays open.
-
-        place: on the canvas, shares of its width and height; the panel's own point at these shares lies there.
-        """
+        """A panel, and a note of where it lies. Yields whether it stays open. place: on the canvas, shares of its width
+        and height; the panel's own point at these shares lies there."""
         sides = self.viewport.canvas.get_logical_size()
         corner = tuple(_GAP + share * (side - 2 * _GAP) for share, side in zip(place, sides, strict=True))
         imgui.set_next_window_pos(corner, imgui.Cond_.always, place)
@@ -64,7 +69,14 @@ class Panels(ImguiRenderer):
         self._covered.clear()
         if state.show_help:
             with self._panel("Keys and mouse", (0.5, 0.5), _FIXED | _FITTING, closable=True) as stays:
-                _help()
+                if imgui.begin_table("keys", 2):
+                    for shown, text in (*((key.shown, key.help) for key in KEYS), *MOUSE):
+                        imgui.table_next_row()
+                        imgui.table_next_column()
+                        imgui.text_colored(_ACCENT, shown)
+                        imgui.table_next_column()
+                        imgui.text(text)
+                    imgui.end_table()
             state.show_help = bool(stays)
         if not state.show_panels:
             return
@@ -84,13 +96,13 @@ class Panels(ImguiRenderer):
         """Fill the panel at the left."""
         state, frame = self.state, self.viewport.frame
         state.mode = _choice("mode", state.mode, state.renderer.modes())
-        _tip(MODES[state.mode])
+        imgui.set_item_tooltip(MODES[state.mode])
         if frame is not None and frame.request.mode in ("depth", "motion"):
             imgui.text(f"dark {frame.low:.3g}, bright {frame.high:.3g}")
         state.background = _choice("ground", state.background, list(BACKGROUNDS.values()), list(BACKGROUNDS))
-        _tip("background")
+        imgui.set_item_tooltip("background")
         _, state.antialiased = imgui.checkbox("antialiased", state.antialiased)
-        _tip("Mip-Splatting's filter, as antialiased trainings draw (X)")
+        imgui.set_item_tooltip("Mip-Splatting's filter, as antialiased trainings draw (X)")
         if _button("Reset", tip="camera back to where it started (R)"):
             state.camera.reset()
         imgui.same_line()
@@ -123,17 +135,6 @@ class Panels(ImguiRenderer):
         imgui.text(self.viewport.device.info.name[:34])
 
 
-def _help() -> None:
-    if imgui.begin_table("keys", 2):
-        for shown, text in (*((key.shown, key.help) for key in KEYS), *MOUSE):
-            imgui.table_next_row()
-            imgui.table_next_column()
-            imgui.text_colored(_ACCENT, shown)
-            imgui.table_next_column()
-            imgui.text(text)
-        imgui.end_table()
-
-
 def _time_slider(state: ViewState) -> None:
     """Fill the present imgui window with the slider and its transport: play, step, frame rate, speed, loop."""
     clock = state.clock
@@ -145,7 +146,9 @@ def _time_slider(state: ViewState) -> None:
     moved, time = imgui.slider_float("##time", clock.time, 0.0, 1.0, label, imgui.SliderFlags_.no_input)
     if imgui.is_item_deactivated() and imgui.is_mouse_released(imgui.MouseButton_.left):
         # imgui leaves out where the mouse went since the last frame, which is far where frames take long.
-        moved, time = True, _slider_value()
+        half_grab = imgui.get_style().grab_min_size / 2 + 2  # imgui's own padding
+        left, right = imgui.get_item_rect_min().x + half_grab, imgui.get_item_rect_max().x - half_grab
+        moved, time = True, (imgui.get_mouse_pos().x - left) / max(right - left, 1.0)
     if moved:
         clock.playing = False
         clock.seek(time)
@@ -171,26 +174,10 @@ def _time_slider(state: ViewState) -> None:
     imgui.end_disabled()
 
 
-def _slider_value() -> float:
-    """Return the value, 0 to 1, at which the grab of the last item, a slider, lies under the mouse."""
-    half_grab = imgui.get_style().grab_min_size / 2 + 2  # imgui's own padding
-    left, right = imgui.get_item_rect_min().x + half_grab, imgui.get_item_rect_max().x - half_grab
-    return float((imgui.get_mouse_pos().x - left) / max(right - left, 1.0))
-
-
-def _style() -> None:
-    style = imgui.get_style()
-    style.window_rounding, style.frame_rounding, style.grab_rounding = 6.0, 4.0, 4.0
-    style.window_border_size = 0.0
-    style.grab_min_size = 14.0
-    style.set_color_(imgui.Col_.window_bg, (0.08, 0.08, 0.09, 0.85))
-    style.set_color_(imgui.Col_.slider_grab, _ACCENT)
-    style.set_color_(imgui.Col_.slider_grab_active, _ACCENT)
-
-
 def _button(label: str, width: float = 66, tip: str = "") -> bool:
     pressed = bool(imgui.button(label, (width, 0)))
-    _tip(tip)
+    if tip:
+        imgui.set_item_tooltip(tip)
     return pressed
 
 
@@ -199,8 +186,3 @@ def _choice(label: str, present: T, choices: Sequence[T], names: Sequence[str] |
     at = choices.index(present) if present in choices else -1
     changed, chosen = imgui.combo(label, at, list(map(str, choices if names is None else names)))
     return choices[chosen] if changed else present
-
-
-def _tip(text: str) -> None:
-    if text and imgui.is_item_hovered(imgui.HoveredFlags_.allow_when_disabled):
-        imgui.set_tooltip(text)

@@ -17,9 +17,9 @@ from typing import Any
 from rendercanvas.http import HttpRenderCanvas, asgi, loop, resources
 
 from lapgs_wgpu.errors import InputError, optional_module
+from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.viewer.app import App
-from lapgs_wgpu.viewer.loaded_scene import LoadedScene
-from lapgs_wgpu.viewer.view_state import ViewState
+from lapgs_wgpu.viewer.loaded_scene import given_scene
 from lapgs_wgpu.viewer.web_page import web_file
 from lapgs_wgpu.viewer.window import check_imgui
 
@@ -58,17 +58,20 @@ From another machine: ssh -L {port}:{end}:{port} USER@THIS_MACHINE, then open ht
     return f"{text}\nPictures and token go over the network as they are; through the tunnel they are encrypted."
 
 
-def run_remote(scene: LoadedScene, listening: socket.socket, host: str, start: Callable[[ViewState], None]) -> None:
-    """Show it to browsers until Ctrl-C, which raises KeyboardInterrupt. start: as for run_window."""
+def run_remote(given: Any, device: Callable[[], Device]) -> None:
+    """Show the file to browsers, as run_window does, until Ctrl-C, which raises KeyboardInterrupt."""
+    host = given.host or "127.0.0.1"
+    listening = listen(host, 8080 if given.port is None else given.port)
     import uvicorn
 
+    scene = given_scene(given, device)
     # The page is rendercanvas's, whose scripts it uses, but its canvas fills the window.
     # rendercanvas takes Ctrl-C from uvicorn when its loop starts, closes the canvas and leaves the server running.
     loop._BaseLoop__setup_interrupt_hooks = dict
     name, token = scene.path.name, secrets.token_urlsafe(24)
     resources["index.html"] = "text/html", web_file("remote.html").replace("{{title}}", html.escape(name))
     app = App(RemoteCanvas(title=name, update_mode="ondemand", max_fps=60), loop, scene)
-    start(app.state)
+    app.state.begin(given)
     config = uvicorn.Config(
         guarded(asgi, token),
         log_level="warning",
@@ -108,12 +111,8 @@ def guarded(app: Application, token: str) -> Application:
 
 
 class RemoteCanvas(HttpRenderCanvas):
-    """rendercanvas's canvas for browsers, which is experimental, with corrections.
-
-    Pictures go out as JPEG while something moves, and once more as PNG when nothing has for 0.3 seconds.
-
-    The first browser that is connected drives, the others watch.
-    """
+    """rendercanvas's canvas for browsers, which is experimental, with corrections. The first browser that is connected
+    drives, the others watch. Pictures go out as JPEG, and once more as PNG when nothing has moved for 0.3 seconds."""
 
     def __init__(self, **options: Any) -> None:
         self._sizes: dict[int, dict[str, Any]] = {}  # last resize event of each browser

@@ -10,8 +10,7 @@ from lapgs_wgpu.viewer.render_modes import BACKGROUNDS, Mode
 
 @dataclass
 class TrainingControl:
-    """Pauses a training. last: the last finished step, a StepResult. single: steps that still run although it is
-    paused."""
+    """Pauses a training. last: its last StepResult. single: number of steps that still run although it is paused."""
 
     last: Any = None
     paused: bool = False
@@ -19,11 +18,9 @@ class TrainingControl:
 
 
 class ViewState:
-    """Panels read and set the attributes; keys call the methods and turn the flags (viewer/controls). Knows no
-    window and no GUI.
+    """Panels read and set the attributes; keys call the methods and turn the flags (viewer/controls).
 
-    view: number of the capture's camera that was chosen last, -1 before. training: the training under way; None where a
-    file is shown.
+    view: number of the capture's camera that was chosen last, -1 before. training: None where a file is shown.
     """
 
     def __init__(self, scene: LoadedScene) -> None:
@@ -37,6 +34,21 @@ class ViewState:
         self.antialiased = scene.playback.at(0.0).antialiased
         self.show_transport = scene.playback.moves
         self.view = -1
+
+    def begin(self, given: Any) -> None:
+        """Begin as the options of lapgs-view say. Raises InputError where the capture lacks the view."""
+        self.mode = given.mode or self.mode
+        if given.view is not None:
+            self.stand_at(self.scene.view_number(given.view))
+        self.background = BACKGROUNDS.get(given.background, self.background)
+        self.show_transport = bool(given.time_slider or self.show_transport)
+        clock = self.clock
+        if given.time is not None:
+            clock.seek(given.time)
+        clock.fps, clock.speed = given.fps or clock.fps, given.speed or clock.speed
+        clock.loop = given.loop or clock.loop
+        if given.play:
+            clock.toggle()
 
     def stand_at(self, view: int) -> None:
         """Go to a camera of the capture and to its time."""

@@ -52,18 +52,17 @@ PASSES: dict[str, tuple[str, Defines]] = {
     "deform MOTION": ("deform", _HEADS | {"HEADS": 4, "MOTION": 1}),
     "deform COLOR MOTION": ("deform", _HEADS | {"HEADS": 5, "MOTION": 1, "COLOR": 1}),
 }  # fmt: skip
-_FIELD = ("hashgrid_slice", "hashgrid SLICED", "hashgrid")  # beside one of deform
-_CHOSEN = ("color", "rasterize", "deform")  # one of each
 _DESKTOP_ACTIONS = ("next_mode", "next_view", "toggle_pause", "step_training")
 
 
 def player_data() -> dict[str, Any]:
     """Collect the data of the player: its passes with their bindings and uniforms, and the viewer's constants."""
-    always = [name for name in PASSES if name not in _FIELD and name.split()[0] not in _CHOSEN]
+    field = ("hashgrid_slice", "hashgrid SLICED", "hashgrid")  # beside one of deform
+    chosen = ("color", "rasterize", "deform")  # one of each
     return {
         "kernels": {name: _shader(browser_source(compose(*shape))) for name, shape in PASSES.items()},
-        "always": always,
-        "field": _FIELD,
+        "always": [name for name in PASSES if name not in field and name.split()[0] not in chosen],
+        "field": field,
         "tile": [_PLAIN.tile_width, _PLAIN.tile_height],
         "present": _shader(compose("present", {})),
         "minScale": MIN_SCALE,

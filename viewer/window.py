@@ -7,9 +7,10 @@ from collections.abc import Callable
 from typing import Any
 
 from lapgs_wgpu.errors import InputError, optional_module, pip_install
+from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.viewer.app import App
-from lapgs_wgpu.viewer.loaded_scene import LoadedScene
-from lapgs_wgpu.viewer.view_state import ViewState
+from lapgs_wgpu.viewer.loaded_scene import given_scene
+from lapgs_wgpu.viewer.options import SIZE
 
 
 def check_window(otherwise: str) -> None:
@@ -36,15 +37,14 @@ def check_imgui() -> None:
         ) from None
 
 
-def run_window(scene: LoadedScene, size: tuple[int, int], start: Callable[[ViewState], None]) -> None:
-    """Show a scene until the window is closed.
-
-    size: of the picture, logical pixels. start: puts the state of the view as the window begins. Raises InputError as
-    `start` does, and DeviceError where the device is lost or full.
-    """
-    canvas, loop = make_canvas(f"{scene.path} - lapgs-view", size)
+def run_window(given: Any, device: Callable[[], Device]) -> None:
+    """Show the file in a window, as the options of lapgs-view say, until it is closed. Raises InputError, before the
+    file is read where no window can be opened, and DeviceError where the device is lost or full."""
+    check_window("take --backend http to look in a browser (also from another machine), or --screenshot FILE.png")
+    scene = given_scene(given, device)
+    canvas, loop = make_canvas(f"{scene.path} - lapgs-view", given.size or SIZE)
     app = App(canvas, loop, scene)
-    start(app.state)
+    app.state.begin(given)
     loop.run()
     if app.failed is not None:
         raise app.failed

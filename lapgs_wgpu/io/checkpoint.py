@@ -12,7 +12,7 @@ import numpy as np
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.ply import GaussianSnapshot, read_foreign, read_gaussians, write_ply
-from lapgs_wgpu.io.ply_elements import PathLike, PlyFile, open_ply
+from lapgs_wgpu.io.ply_elements import PathLike, open_ply
 from lapgs_wgpu.io.safetensors_file import Array, Tensors, pack_tensors, unpack_tensors
 
 VERSION = 1
@@ -45,30 +45,27 @@ def write_checkpoint(path: PathLike, still: GaussianSnapshot, tensors: Tensors, 
 
 
 def read_checkpoint(path: PathLike) -> Checkpoint:
-    """Read a checkpoint, or any 3DGS .ply file, which has no tensors.
-
-    Raises InputError when the file is neither, is damaged, or holds NaN or infinity.
-    """
+    """Read a checkpoint, or any 3DGS .ply file, which has no tensors. Raises InputError for any other file."""
     with open_ply(path) as ply:
-        if _ELEMENT in ply.elements:
-            return Checkpoint(read_gaussians(ply), *_read_motion(ply))
-        still, metadata = read_foreign(ply)
-        return Checkpoint(still, {}, metadata)
-
-
-def _read_motion(ply: PlyFile) -> tuple[dict[str, Array], dict[str, str]]:
-    element, where = ply.elements[_ELEMENT], f"{ply.path}: element {_ELEMENT}"
-    pattern = rf"^{_ELEMENT} v([0-9]{{1,9}}) safetensors ([0-9]{{1,18}})$"
-    declared = re.search(pattern, "\n".join(ply.comments), re.MULTILINE)
-    if declared is None or element.properties != {"word": np.dtype("<u4")} or ply.encoding != "binary_little_endian":
-        raise InputError(
-            f"{where} lacks the line 'comment {_ELEMENT} v{VERSION} safetensors BYTES' or the one binary property "
-            "'uint word'; the file is damaged"
-        )
-    version, size = int(declared[1]), int(declared[2])
-    if version != VERSION:
-        raise InputError(f"{where} has version {version}, and this program reads {VERSION}; use the one that wrote it")
-    if not 0 <= 4 * element.count - size < 4:
-        raise InputError(f"{where} declares {size} bytes in {element.count} words of 4 bytes; the file is damaged")
-    ply.file.seek(element.offset)
-    return unpack_tensors(ply.file, size, where)
+        if _ELEMENT not in ply.elements:
+            still, metadata = read_foreign(ply)
+            return Checkpoint(still, {}, metadata)
+        still = read_gaussians(ply)
+        element, where = ply.elements[_ELEMENT], f"{path}: element {_ELEMENT}"
+        pattern = rf"^{_ELEMENT} v([0-9]{{1,9}}) safetensors ([0-9]{{1,18}})$"
+        declared = re.search(pattern, "\n".join(ply.comments), re.MULTILINE)
+        binary = ply.encoding == "binary_little_endian"
+        if declared is None or element.properties != {"word": np.dtype("<u4")} or not binary:
+            raise InputError(
+                f"{where} lacks the line 'comment {_ELEMENT} v{VERSION} safetensors BYTES' or the one binary property "
+                "'uint word'; the file is damaged"
+            )
+        version, size = int(declared[1]), int(declared[2])
+        if version != VERSION:
+            raise InputError(
+                f"{where} has version {version}, and this program reads {VERSION}; use the one that wrote it"
+            )
+        if not 0 <= 4 * element.count - size < 4:
+            raise InputError(f"{where} declares {size} bytes in {element.count} words of 4 bytes; the file is damaged")
+        ply.file.seek(element.offset)
+        return Checkpoint(still, *unpack_tensors(ply.file, size, where))

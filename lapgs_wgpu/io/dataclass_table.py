@@ -102,8 +102,7 @@ _KIND_NAMES = {int: "a whole number", float: "a number", bool: "true or false", 
 
 def field_types(cls: type) -> dict[str, Any]:
     """Field name of a dataclass -> its type."""
-    hints = typing.get_type_hints(cls)
-    return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
+    return typing.get_type_hints(cls)
 
 
 def did_you_mean(name: str, known: Iterable[str], otherwise: str = ".") -> str:

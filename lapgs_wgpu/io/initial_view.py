@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.splat.camera import Camera
 
-_OPEN = 90.0  # degrees; cameras with no wider gap stand all around
-
 
 class InitialView(NamedTuple):
     """Initial state of the viewer.
@@ -41,17 +39,10 @@ class InitialView(NamedTuple):
 
     def to_json(self) -> str:
         """One line of JSON."""
-        camera = self.camera
-        values = {
-            "K": camera.K.tolist(),
-            "T_cam_world": camera.T_cam_world.tolist(),
-            "size": [camera.width, camera.height],
-            "focus": self.focus.tolist(),
-            "up": self.up.tolist(),
-            "frames": self.frames,
-            "arc": self.arc,
-        }
-        return json.dumps(values | ({"near": camera.near} if camera.near else {}))
+        others = self._asdict()
+        camera: Camera = others.pop("camera")
+        values = {"K": camera.K, "T_cam_world": camera.T_cam_world, "size": (camera.width, camera.height)} | others
+        return json.dumps(values | ({"near": camera.near} if camera.near else {}), default=np.ndarray.tolist)
 
     @staticmethod
     def from_json(text: str) -> "InitialView | None":
@@ -63,10 +54,7 @@ class InitialView(NamedTuple):
             camera = Camera(K, T, int(width), int(height), float(values.get("near", 0.0)))
             focus, up = np.array(values["focus"], float), np.array(values["up"], float)
             frames = max(1, min(int(values["frames"]), 1_000_000))
-            arc = None
-            if values.get("arc") is not None:
-                clockwise, counterclockwise = map(float, values["arc"])
-                arc = clockwise, counterclockwise
+            arc: Any = None if values.get("arc") is None else tuple(map(float, values["arc"]))
             if (
                 focus.shape == up.shape == (3,)
                 and np.isfinite([focus, up]).all()
@@ -74,7 +62,7 @@ class InitialView(NamedTuple):
                 and min(K[0, 0], K[1, 1]) > 0
                 and max(camera.width, camera.height) <= 1 << 16
                 and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3)
-                and (arc is None or (min(arc) >= 0 and sum(arc) <= 360))
+                and (arc is None or (len(arc) == 2 and min(arc) >= 0 and sum(arc) <= 360))
             ):
                 return InitialView(camera, focus, up / np.linalg.norm(up), frames, arc)
         return None
@@ -88,7 +76,7 @@ def captured_arc(
     turned = sorted((_bearing(camera, focus, up) - first) % 360 for camera in cameras)
     bounds = [0.0, *turned, 360.0]
     widest = int(np.argmax(np.diff(bounds)))
-    if bounds[widest + 1] - bounds[widest] < _OPEN:
+    if bounds[widest + 1] - bounds[widest] < 90.0:  # cameras with no wider gap stand all around
         return None
     return 360 - bounds[widest + 1], bounds[widest]
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.io.regular_file import PathLike, open_regular
+from lapgs_wgpu.io.safe_json_toml import PathLike, open_regular
 from lapgs_wgpu.io.safetensors_file import Array, Tensors, pack_tensors, unpack_tensors
 
 MAGIC = b"lapgs4d\n"
@@ -29,10 +29,8 @@ def lapgs_bytes(path: PathLike) -> bytes | None:
 
 
 def pack_lapgs(tensors: Tensors, metadata: Mapping[str, str]) -> bytes:
-    """The bytes of a compact scene; equal arguments give equal bytes on every machine with the same zlib.
-
-    Raises InputError where a value is NaN or infinite, or where the reader would refuse the size.
-    """
+    """The bytes of a compact scene; equal arguments give equal bytes on every machine with the same zlib. Raises
+    InputError where a value is NaN or infinite, or where the reader would refuse the size."""
     content = b"".join(bytes(part) for part in pack_tensors(tensors, metadata))
     if len(content) > MAX_BYTES:
         raise InputError(f"a compact scene holds at most {MAX_BYTES} bytes, and this one needs {len(content)}")

@@ -25,8 +25,6 @@ _MOTION = re.compile(  # words of a property's name that speak of time or of mot
 )
 _FLAT = float(np.log(1e-7))  # log of the smallest scale that is drawn
 _SCALES, _UNTURNED = {"scale_0", "scale_1", "scale_2"}, {"rot_0": 1.0, "rot_1": 0.0, "rot_2": 0.0, "rot_3": 0.0}
-_OPAQUE = 20.0  # its sigmoid is 1 in float32
-_FAR = 100.0  # distance of the scene's middle from the origin, in extents of the scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +82,7 @@ def write_ply(
     means, _, dc, others, opacities, scales, quats = np.split(rows, np.cumsum([3, 3, 3, 45, 1, 3]), axis=1)
     means[:], dc[:], scales[:], quats[:] = still.means, still.sh[:, 0], still.log_scales, still.quats
     opacities[:, 0] = still.opacity_logits
-    for channel in range(3):  # channel-major: all of red, then green, then blue
-        others[:, 15 * channel :][:, :rest] = still.sh[:, 1:, channel]
+    others.reshape(n, 3, 15)[:, :, :rest] = still.sh[:, 1:].transpose(0, 2, 1)  # all of red, then green, then blue
     _check_values(rows, _WRITTEN_NAMES, f"{path}: not written, because")
     properties = "".join(f"property float {name}\n" for name in _WRITTEN_NAMES)
     comment = "comment SplatRenderMode: mip\n" if antialiased else ""
@@ -100,8 +97,7 @@ def write_ply(
 def read_gaussians(ply: PlyFile) -> GaussianSnapshot:
     """The Gaussians of an opened checkpoint: properties in any order, SH degree 0 to 3, further scalar ones skipped.
 
-    Takes memory for about twice the Gaussians. Raises InputError when the file is not such a file, is damaged, or holds
-    a value that cannot be rendered.
+    Takes memory for about twice the Gaussians. Raises InputError where it is none, or a value cannot be rendered.
     """
     vertex = vertex_of(ply)
     names = _column_names(vertex, set(vertex.properties), ply.path)
@@ -153,7 +149,7 @@ def read_foreign(ply: PlyFile) -> tuple[GaussianSnapshot, dict[str, str]]:
     if axis:
         metadata["up"] = axis[1].lower()
     middle, extent = _middle_and_extent(values[:, :3].astype(np.float64))
-    if np.abs(middle).max() > _FAR * extent:
+    if np.abs(middle).max() > 100 * extent:  # far from the origin
         means = ply.columns(vertex, ["x", "y", "z"], np.float64)  # in float32 they are terraces
         middle, extent = _middle_and_extent(means)
         if extent > 0:
@@ -253,7 +249,7 @@ def _mended(values: Floats, names: list[str], path: PathLike) -> Floats:
     """Replace in columns what is legal and cannot be rendered as it is, and leave out rows."""
     opacities, scales, quats = values[:, -8], values[:, -7:-4], values[:, -4:]
     invisible = opacities == -np.inf
-    opacities[opacities == np.inf] = _OPAQUE
+    opacities[opacities == np.inf] = 20.0  # its sigmoid is 1 in float32
     scales[scales == -np.inf] = _FLAT
     quats[(quats == 0).all(axis=1)] = [1, 0, 0, 0]
     bad = np.zeros(len(values), bool)

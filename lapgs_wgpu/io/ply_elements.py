@@ -18,7 +18,7 @@ from numpy.lib.recfunctions import structured_to_unstructured
 from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.io.regular_file import PathLike, open_regular
+from lapgs_wgpu.io.safe_json_toml import PathLike, open_regular
 
 Floats = NDArray[np.float32]
 
@@ -29,12 +29,12 @@ _OTHERS = {  # what is given in place of a PLY file, by its first bytes in small
     b"\x1f\x8b": "is packed by gzip; unpack it",
     b"<!doctype html": "is a web page, and this is not a browser; give the checkpoint that it was made of",
 }
-SPLATS = (".spz", ".sog", ".splat", ".ksplat", ".lcc")  # formats of stills that others convert to .ply
 MAX_HEADER_BYTES = 64 * 1024
 SH_C0 = 0.28209479177387814  # the harmonic of degree 0: f_dc * SH_C0 + 0.5 is a color
-_PREFIXES = ("", "diffuse_", "vertex_", "scalar_", "ambient_", "color_", "cd_")
 _TRIPLES = [
-    [f"{before}{name}" for name in names] for before in _PREFIXES for names in (("red", "green", "blue"), "rgb")
+    [f"{before}{name}" for name in names]
+    for before in ("", "diffuse_", "vertex_", "scalar_", "ambient_", "color_", "cd_")
+    for names in (("red", "green", "blue"), "rgb")
 ]
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 _SCALARS = {
@@ -77,57 +77,51 @@ class PlyFile(NamedTuple):
         """(N, len(names)): the named properties of all rows of an element. Raises InputError."""
         if element.count == 0:
             return np.empty((0, len(names)), dtype)
-        with np.errstate(all="ignore"):  # a double beyond float32 becomes infinite, which callers report
-            rows = self._rows(element)
+        with np.errstate(all="ignore"), warnings.catch_warnings(action="ignore"):  # of lines without numbers
+            if self.encoding != "ascii":
+                self.file.seek(element.offset)
+                rows = np.fromfile(self.file, element.row, element.count)
+            else:
+                self.file.seek(self.header_bytes)
+                row = np.dtype([(name, np.float64) for name in element.properties])
+                options: dict[str, Any] = {"comments": None, "ndmin": 1, "encoding": "latin1"}
+                try:
+                    rows = np.loadtxt(self.file, row, skiprows=element.offset, max_rows=element.count, **options)
+                except ValueError as error:
+                    raise InputError(f"{self.path}: its lines do not hold the declared numbers ({error}).") from None
             if len(rows) < element.count:
                 raise InputError(f"{self.path}: has {len(rows)} of the {element.count} rows declared; it is cut off.")
+            # A double beyond float32 becomes infinite, which callers report.
             values: NDArray[Any] = structured_to_unstructured(rows[names], dtype, copy=True)
             return values
-
-    def _rows(self, element: Element) -> NDArray[Any]:
-        if self.encoding != "ascii":
-            self.file.seek(element.offset)
-            return np.fromfile(self.file, element.row, element.count)
-        self.file.seek(self.header_bytes)
-        row = np.dtype([(name, np.float64) for name in element.properties])
-        options: dict[str, Any] = {"comments": None, "ndmin": 1, "encoding": "latin1"}
-        try:
-            with warnings.catch_warnings(action="ignore"):  # of lines without numbers
-                return np.loadtxt(self.file, row, skiprows=element.offset, max_rows=element.count, **options)
-        except ValueError as error:
-            raise InputError(f"{self.path}: its lines do not hold the declared numbers ({error}).") from None
 
 
 @contextmanager
 def open_ply(path: PathLike) -> Iterator[PlyFile]:
     """Open a file and read its header. The sizes of the elements add up to the file size. Raises InputError."""
     with open_regular(path) as file:
-        yield _read_header(file, path)
-
-
-def _read_header(file: BinaryIO, path: PathLike) -> PlyFile:
-    head = file.read(MAX_HEADER_BYTES)
-    if re.match(rb"ply\r?\n", head) is None:
-        ending = Path(path).suffix.lower()
-        if ending in SPLATS:
-            raise InputError(f"{path}: is a {ending} file, which is not read; splat-transform converts it.")
-        otherwise = (
-            f"begins with {head[:8]!r} ({len(head)} bytes were read), where a PLY file begins with the line 'ply'; "
-            "convert it to .ply, a cloud of points with CloudCompare for example"
-        )
-        told = (text for begin, text in _OTHERS.items() if head[:32].lower().startswith(begin))
-        raise InputError(f"{path}: {next(told, otherwise)}.")
-    end = re.search(rb"^end_header\r?\n", head, re.MULTILINE)
-    if end is None:
-        raise InputError(
-            f"{path}: has no line 'end_header' in its first {len(head)} bytes (at most {MAX_HEADER_BYTES} are read): "
-            "it is truncated or not a .ply file."
-        )
-    lines = head[: end.start()].decode(errors="replace").split("\n")[1:-1]  # comments may be in any encoding
-    encoding, elements = _parse_lines(lines, path)
-    comments = [" ".join(line.split()[1:]) for line in lines if line.startswith(("comment", "obj_info"))]
-    placed = _place(elements, encoding, end.end(), file, path)
-    return PlyFile(file, path, encoding, end.end(), placed, comments)
+        head = file.read(MAX_HEADER_BYTES)
+        if re.match(rb"ply\r?\n", head) is None:
+            ending = Path(path).suffix.lower()
+            if ending in (".spz", ".sog", ".splat", ".ksplat", ".lcc"):  # stills
+                raise InputError(f"{path}: is a {ending} file, which is not read; splat-transform converts it.")
+            otherwise = (
+                f"begins with {head[:8]!r} ({len(head)} bytes were read), where a PLY file begins with the line 'ply'; "
+                "convert it to .ply, a cloud of points with CloudCompare for example"
+            )
+            told = (text for begin, text in _OTHERS.items() if head[:32].lower().startswith(begin))
+            raise InputError(f"{path}: {next(told, otherwise)}.")
+        end = re.search(rb"^end_header\r?\n", head, re.MULTILINE)
+        if end is None:
+            raise InputError(
+                f"{path}: has no line 'end_header' in its first {len(head)} bytes (at most {MAX_HEADER_BYTES} are "
+                "read): it is truncated or not a .ply file."
+            )
+        lines = head[: end.start()].decode(errors="replace").split("\n")[1:-1]  # comments may be in any encoding
+        encoding, elements = _parse_lines(lines, path)
+        comments = [" ".join(line.split()[1:]) for line in lines if line.startswith(("comment", "obj_info"))]
+        placed = _place(elements, encoding, end.end(), file, path)
+        yield PlyFile(file, path, encoding, end.end(), placed, comments)
 
 
 def _parse_lines(lines: list[str], path: PathLike) -> tuple[str, dict[str, Element]]:

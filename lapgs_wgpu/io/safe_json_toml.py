@@ -1,4 +1,4 @@
-"""Read JSON and TOML from untrusted files within bounds on memory and time.
+"""Open untrusted files, and read JSON and TOML from them within bounds on memory and time.
 
 Parsing JSON takes at most 64 times the file size in memory. The TOML parser is slow, so its size limit is low.
 """
@@ -6,18 +6,33 @@ Parsing JSON takes at most 64 times the file size in memory. The TOML parser is 
 import json
 import os
 import re
+import stat
 import tomllib
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, BinaryIO
 
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.io.regular_file import PathLike, open_regular
 
+PathLike = str | os.PathLike[str]
 MAX_JSON_BYTES = 64 << 20
 MAX_TOML_BYTES = 256 << 10
 MAX_DEPTH = 32  # nesting of lists and tables
 # tomllib needs quadratic time in the number of parts of a dotted key. Our keys have at most three parts.
 _LONG_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]+|"(?:[^"\\\n]|\\.)*"|'[^'\n]*')[ \t]*\.[ \t]*){16}""")
+
+
+@contextmanager
+def open_regular(path: PathLike) -> Iterator[BinaryIO]:
+    """Open a regular file for reading: no pipe, which would block, and no device, which may never end. Raises
+    InputError, also for errors of the file system while it is open."""
+    try:
+        if not stat.S_ISREG(os.stat(path).st_mode):
+            raise InputError(f"{path}: is not a regular file; give the file itself.")
+        with open(path, "rb") as file:
+            yield file
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path.") from error
 
 
 def read_json(path: PathLike) -> Any:

@@ -11,7 +11,7 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device, open_device
 from lapgs_wgpu.io.checkpoint import write_checkpoint
 from lapgs_wgpu.io.ply import GaussianSnapshot
-from lapgs_wgpu.io.regular_file import PathLike
+from lapgs_wgpu.io.safe_json_toml import PathLike
 from lapgs_wgpu.motion.fields.config import MIN_SCALE, FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation, Deformed, Field, Nearby, TimeSamples
 from lapgs_wgpu.motion.fields.grid_field import GridField

@@ -14,8 +14,7 @@ from lapgs_wgpu.io.checkpoint import read_checkpoint
 from lapgs_wgpu.io.dataclass_table import build_dataclass
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.io.lapgs_file import lapgs_bytes, pack_lapgs, unpack_lapgs
-from lapgs_wgpu.io.regular_file import PathLike
-from lapgs_wgpu.io.safe_json_toml import parse_json
+from lapgs_wgpu.io.safe_json_toml import PathLike, parse_json
 from lapgs_wgpu.io.safetensors_file import Tensors
 from lapgs_wgpu.motion.compact_scene import compress, expand, tensor_of
 from lapgs_wgpu.motion.fields.config import FieldConfig

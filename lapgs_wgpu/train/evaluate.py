@@ -20,7 +20,7 @@ from lapgs_wgpu.data.images import encode_png
 from lapgs_wgpu.data.views import View, composite
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
-from lapgs_wgpu.io.regular_file import open_regular
+from lapgs_wgpu.io.safe_json_toml import open_regular
 from lapgs_wgpu.io.safetensors_file import unpack_tensors
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.progress import counted

@@ -17,8 +17,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.io.folder_lock import LOCK
 from lapgs_wgpu.io.listing import listed
-from lapgs_wgpu.io.regular_file import open_regular
-from lapgs_wgpu.io.safe_json_toml import read_toml
+from lapgs_wgpu.io.safe_json_toml import open_regular, read_toml
 from lapgs_wgpu.io.safetensors_file import pack_tensors, unpack_tensors
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.host import environment, step_threads
