@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +19,17 @@ from lapgs_wgpu.data.video_frames import (
     pixel_aspect,
 )
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.prepare.hdr import TRANSFERS, to_sdr
 from lapgs_wgpu.progress import say
 
 _FAST_BILINEAR = 0x1  # of swscale: exact enough for a thumbnail
+
+Transfer = Literal["HLG", "PQ"]  # of high dynamic range, with BT.2020's primaries; phones record HLG
+TRANSFERS: dict[int, Transfer] = {18: "HLG", 16: "PQ"}  # by their numbers in ISO/IEC 23091-2
+REFERENCE_WHITE = 203.0  # cd/m2, ITU-R BT.2408
+PEAK = 1000.0  # cd/m2 of the display for which HLG is shown
+KNEE = 0.75  # of the reference white: above it light is rolled off
+TO_BT709 = np.array([[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]], np.float32)
+LUMINANCE = np.array([0.2627, 0.6780, 0.0593], np.float32)  # of BT.2020's red, green, blue
 
 
 class Frame(NamedTuple):
@@ -35,15 +42,6 @@ class Frame(NamedTuple):
     pixels: Callable[[int], Pixels]
     name: str = ""
     exif: bytes = b""
-
-
-def _pixels(frame: Any, size: Size, shape: Display, longer_side: int) -> Pixels:
-    """size: of the frame's square pixels, not yet turned."""
-    width, height = shrunk_size(size, longer_side)
-    transfer = TRANSFERS.get(int(frame.color_trc))
-    form = "rgb24" if transfer is None else "rgb48le"
-    image = frame.to_ndarray(format=form, width=width, height=height, interpolation=EXACT_COLORS)
-    return shape.apply(image if transfer is None else to_sdr(image, transfer))
 
 
 class Film:
@@ -69,9 +67,14 @@ class Film:
         if first is None:
             raise InputError(f"{path} has no frame that can be decoded; give the recording itself.")
         self._began = first.time or 0.0
-        self.size: Size = display(first).size(_squared((first.width, first.height), self._aspect))
+        self.size = self._shown(first)[1]
         if first.interlaced_frame:
             say(f"{path}: {INTERLACED}.")
+
+    def _shown(self, frame: Any) -> tuple[Display, Size]:
+        """How a frame is shown, and its (width, height) in square pixels then: the width follows their aspect."""
+        shape = display(frame)
+        return shape, shape.size((max(1, round(frame.width * self._aspect)), frame.height))
 
     def frames(self) -> Iterator[Frame]:
         """Decode the frames in the order of their times. Raises InputError; a film that is damaged after its first
@@ -81,9 +84,7 @@ class Film:
         with opened_film(self.path) as (file, stream):
             try:
                 for frame in file.decode(stream):
-                    shape = display(frame)
-                    shown = _squared((frame.width, frame.height), self._aspect)
-                    size = shape.size(shown)
+                    shape, size = self._shown(frame)
                     if size != self.size:
                         raise InputError(
                             f"{self.path}: frame {number} has {size_text(size)} pixels and the first has "
@@ -95,7 +96,8 @@ class Film:
                     seconds = max(seconds, 0.0)
                     if seconds >= self.start - 0.5 / self.rate:
                         begin = seconds if begin is None else begin
-                        yield Frame(seconds - begin, _gray(frame, shown, shape), partial(_pixels, frame, shown, shape))
+                        pixels = partial(_pixels, frame, shape.size(size), shape)
+                        yield Frame(seconds - begin, pixels(THUMBNAIL, gray=True).astype(np.float32), pixels)
                     number, last = number + 1, seconds
             except av.error.FFmpegError:
                 if number < 2:
@@ -110,12 +112,35 @@ class Film:
             say(f"{self.path}: frames without a time stamp of their own are taken as {self.rate:g} a second.")
 
 
-def _squared(coded: Size, aspect: float) -> Size:
-    """The size in which pixels are square: the width follows."""
-    return max(1, round(coded[0] * aspect)), coded[1]
+def _pixels(frame: Any, size: Size, shape: Display, longer_side: int, *, gray: bool = False) -> Pixels:
+    """(H, W, 3), or (H, W) gray. size: of the frame's square pixels, not yet turned."""
+    width, height = shrunk_size(size, longer_side)
+    transfer = None if gray else TRANSFERS.get(int(frame.color_trc))
+    form, way = ("gray", _FAST_BILINEAR) if gray else ("rgb48le" if transfer else "rgb24", EXACT_COLORS)
+    image = frame.to_ndarray(format=form, width=width, height=height, interpolation=way)
+    return shape.apply(to_sdr(image, transfer) if transfer else image)
 
 
-def _gray(frame: Any, size: Size, shape: Display) -> NDArray[np.float32]:
-    width, height = shrunk_size(size, THUMBNAIL)
-    small = frame.to_ndarray(format="gray", width=width, height=height, interpolation=_FAST_BILINEAR)
-    return shape.apply(small).astype(np.float32)
+def to_sdr(image: NDArray[np.uint16], transfer: Transfer) -> Pixels:
+    """(H, W, 3) uint16 R'G'B' of ITU-R BT.2100 -> (H, W, 3) uint8 sRGB.
+
+    A display of the web shows HDR's reference white at full level: light above the knee is rolled off.
+    """
+    signal = np.linspace(0, 1, 4096)  # 12 bits, more than films have
+    if transfer == "HLG":  # relative light of the scene, by whose brightness the display changes it
+        a, b, c = 0.17883277, 0.28466892, 0.55991073
+        table = np.where(signal <= 0.5, signal**2 / 3, (np.exp((signal - c) / a) + b) / 12)
+        light = table.astype(np.float32)[image >> 4]
+        light *= (PEAK / REFERENCE_WHITE) * np.maximum(light @ LUMINANCE, 1e-6)[..., None] ** np.float32(0.2)
+    else:  # light of the display
+        m1, m2, c1, c2, c3 = 0.1593017578125, 78.84375, 0.8359375, 18.8515625, 18.6875
+        root = signal ** (1 / m2)
+        table = 10000 / REFERENCE_WHITE * (np.maximum(root - c1, 0) / (c2 - c3 * root)) ** (1 / m1)
+        light = table.astype(np.float32)[image >> 4]
+    light = np.clip(light @ TO_BT709.T, 0, None)
+    strongest = light.max(axis=2, keepdims=True)
+    above = np.maximum(strongest - KNEE, 0) / (1 - KNEE)  # is bent, with the same slope at the knee
+    rolled_off = np.where(strongest <= KNEE, strongest, KNEE + (1 - KNEE) * above / (1 + above)).astype(np.float32)
+    light *= rolled_off / np.maximum(strongest, 1e-6)  # of all channels alike, which keeps the hue
+    shown = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    return np.floor(np.clip(shown, 0, 1) * 255 + 0.5).astype(np.uint8)
