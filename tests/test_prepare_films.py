@@ -13,9 +13,8 @@ from PIL import Image
 from lapgs_wgpu.data.video_frames import display
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.film import Film, Transfer, to_sdr
-from lapgs_wgpu.prepare.images import Picture, extract, extract_in_step, images_per_second
-from lapgs_wgpu.prepare.rig import common_times, shapes_of
-from lapgs_wgpu.prepare.sound import start_together
+from lapgs_wgpu.prepare.images import Picture, extract, images_per_second
+from lapgs_wgpu.prepare.rig import common_times, extract_in_step, shapes_of, start_together
 
 av = pytest.importorskip("av")
 

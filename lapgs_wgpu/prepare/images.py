@@ -7,14 +7,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
-from lapgs_wgpu.data.images import Pixels, Size, blurred, repeats, sharpness, shrunk_size
+from lapgs_wgpu.data.images import Pixels, blurred, repeats, sharpness
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.film import Film, Frame
-from lapgs_wgpu.prepare.poses import import_cv2
-from lapgs_wgpu.prepare.sound import start_together
 from lapgs_wgpu.progress import counted, say
 
 FRAMES_PER_SECOND = 10.0  # of one moving camera: poses change slowly
@@ -30,22 +27,6 @@ class Picture(NamedTuple):
 
     name: str
     seconds: float
-
-
-class Shape(NamedTuple):
-    """How the frames of a camera become images of one size. shrunk: (width, height) of the frames before. cut: rows and
-    columns of the shrunk frame. bent: (H, W, 2) places in the shrunk frame of the image's pixels, to undistort it."""
-
-    shrunk: Size
-    cut: tuple[slice, slice] = (slice(None), slice(None))
-    bent: NDArray[np.float32] | None = None
-
-    def apply(self, frame: Frame) -> Pixels:
-        image = frame.pixels(max(self.shrunk))
-        if self.bent is None:
-            return image[self.cut]
-        cv2 = import_cv2()
-        return cv2.remap(image, self.bent[..., 0], self.bent[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 def images_per_second(films: Sequence[Film], asked: float | None) -> float:
@@ -66,16 +47,14 @@ def extract(film: Film, images: Path, fps: float) -> list[Picture]:
 
     Raises InputError for a film that is black or gives less than 2 images.
     """
-    pictures: list[Picture] = []
-    sharp: list[float] = []
-    repeated, before, shape = 0, None, Shape(shrunk_size(film.size, LONGER_SIDE))
-    for _, frames in _spans(film, fps):
+    pictures, sharp, repeated, before = list[Picture](), list[float](), 0, None
+    for _, frames in spans(film, fps):
         best = max(frames, key=lambda frame: sharpness(frame.gray))
         if before is not None and repeats(best.gray, before):
             repeated += 1
             continue
         before = best.gray
-        pictures.append(_write(best, images, "", shape))
+        pictures.append(write_image(best, best.pixels(LONGER_SIDE), images))
         sharp.append(sharpness(best.gray))
     soft = blurred(np.array(sharp))
     for picture in itertools.compress(pictures, soft):
@@ -89,31 +68,7 @@ def extract(film: Film, images: Path, fps: float) -> list[Picture]:
     return kept
 
 
-def extract_in_step(
-    films: Sequence[Film], images: Path, fps: float, shapes: Sequence[Shape]
-) -> list[dict[int, Picture]]:
-    """Write the images of cameras that stand still, below cam00, cam01, ...: by the number of their span of time, which
-    is that of the other cameras' images of this time.
-
-    None is left out, and all films end with the shortest.
-    """
-    start_together(films)
-    cameras = []
-    for number, (film, shape) in enumerate(zip(films, shapes, strict=True)):
-        spans = _spans(film, fps)
-        pictures = {span: _write(next(frames), images, f"cam{number:02d}/", shape) for span, frames in spans}
-        say(f"{film.path}: cam{number:02d}, {len(pictures)} images, one of each {1 / fps:.2g} s")
-        cameras.append(pictures)
-    last = min(map(max, cameras))
-    longer = [(pictures, span) for pictures in cameras for span in pictures if span > last]
-    if longer:
-        say(f"the films are not equally long: all are cut to {last / fps:.2f} s.")
-    for pictures, span in longer:
-        (images / pictures.pop(span).name).unlink()
-    return cameras
-
-
-def _spans(film: Film, fps: float) -> Iterator[tuple[int, Iterator[Frame]]]:
+def spans(film: Film, fps: float) -> Iterator[tuple[int, Iterator[Frame]]]:
     """The number of each 1 / fps seconds of a film, and its frames. Raises InputError for a film that is black."""
     return itertools.groupby(_lit(film), lambda frame: math.floor(frame.seconds * fps + 1e-3))  # stamps are rounded
 
@@ -130,9 +85,9 @@ def _lit(film: Film) -> Iterator[Frame]:
         )
 
 
-def _write(frame: Frame, images: Path, prefix: str, shape: Shape) -> Picture:
-    """Write a JPEG image. prefix: of its name, such as "cam00/"."""
+def write_image(frame: Frame, pixels: Pixels, images: Path, prefix: str = "") -> Picture:
+    """Write a frame's image as a JPEG file. prefix: of its name, such as "cam00/"."""
     name = f"{prefix}{frame.name or f'{round(1000 * frame.seconds):08d}'}.jpg"
     (images / name).parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(shape.apply(frame)).save(images / name, quality=95, subsampling=0, exif=frame.exif)
+    Image.fromarray(pixels).save(images / name, quality=95, subsampling=0, exif=frame.exif)
     return Picture(name, frame.seconds)

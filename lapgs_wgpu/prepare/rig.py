@@ -1,28 +1,48 @@
-"""Cameras that stand still and film together: placed by what they see, or by a calibration, with images of one size."""
+"""Cameras that stand still and film together: brought into step by their sound, placed by what they see, or by a
+calibration, with images of one size."""
 
 import itertools
 import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from lapgs_wgpu.data.evenly import evenly
-from lapgs_wgpu.data.images import shrunk_size, size_text
+from lapgs_wgpu.data.images import Pixels, Size, shrunk_size, size_text
 from lapgs_wgpu.data.readers.panoptic import FILES, IMAGES
 from lapgs_wgpu.data.stamps import natural_key
 from lapgs_wgpu.data.timestamps import CAMERAS
+from lapgs_wgpu.data.video_frames import import_av
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.calibration import Calibrated, match_names, read_calibration
 from lapgs_wgpu.prepare.capture_folder import RefusedError
-from lapgs_wgpu.prepare.film import Film
-from lapgs_wgpu.prepare.images import LONGER_SIDE, Picture, Shape, extract_in_step
-from lapgs_wgpu.prepare.poses import Reconstruction
+from lapgs_wgpu.prepare.film import Film, Frame
+from lapgs_wgpu.prepare.images import LONGER_SIDE, Picture, spans, write_image
+from lapgs_wgpu.prepare.poses import Floats, Plane, Reconstruction, import_cv2
 from lapgs_wgpu.progress import say
 
 LENS = "SIMPLE_RADIAL"  # few images do not determine more parameters
+RATE, STEP = 8000, 40  # samples of sound a second; of one value
+SURE = 8.0  # standard deviations of the likeness at all shifts, by which that of the best one stands out
+
+
+class Shape(NamedTuple):
+    """How the frames of a camera become images of one size. shrunk: (width, height) of the frames before. cut: rows and
+    columns of the shrunk frame. bent: (H, W, 2) places in the shrunk frame of the image's pixels, to undistort it."""
+
+    shrunk: Size
+    cut: tuple[slice, slice] = (slice(None), slice(None))
+    bent: Plane | None = None
+
+    def apply(self, frame: Frame) -> Pixels:
+        image = frame.pixels(max(self.shrunk))
+        if self.bent is None:
+            return image[self.cut]
+        cv2 = import_cv2()
+        return cv2.remap(image, self.bent[..., 0], self.bent[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 def shapes_of(films: Sequence[Film]) -> list[Shape]:
@@ -45,6 +65,31 @@ def shapes_of(films: Sequence[Film]) -> list[Shape]:
     if len(set(sizes)) > 1:
         say(f"the films have {len(set(sizes))} sizes: all images become {size_text((width, height))} pixels.")
     return shapes
+
+
+def extract_in_step(
+    films: Sequence[Film], images: Path, fps: float, shapes: Sequence[Shape]
+) -> list[dict[int, Picture]]:
+    """Write the images of cameras that stand still, below cam00, cam01, ...: by the number of their span of time, which
+    is that of the other cameras' images of this time.
+
+    None is left out, and all films end with the shortest.
+    """
+    start_together(films)
+    cameras = []
+    for number, (film, shape) in enumerate(zip(films, shapes, strict=True)):
+        firsts = ((span, next(frames)) for span, frames in spans(film, fps))
+        prefix = f"cam{number:02d}/"
+        pictures = {span: write_image(frame, shape.apply(frame), images, prefix) for span, frame in firsts}
+        say(f"{film.path}: cam{number:02d}, {len(pictures)} images, one of each {1 / fps:.2g} s")
+        cameras.append(pictures)
+    last = min(map(max, cameras))
+    longer = [(pictures, span) for pictures in cameras for span in pictures if span > last]
+    if longer:
+        say(f"the films are not equally long: all are cut to {last / fps:.2f} s.")
+    for pictures, span in longer:
+        (images / pictures.pop(span).name).unlink()
+    return cameras
 
 
 def place_still(films: Sequence[Film], images: Path, fps: float, work: Path) -> tuple[list[Picture], Any]:
@@ -121,3 +166,55 @@ def _assigned(films: Sequence[Film], calibration: Path) -> list[Calibrated]:
         )
     say(f"{calibration}: " + ", ".join(f"{name} is camera {found[name]}" for name in names))
     return [cameras[found[name]] for name in names]
+
+
+def start_together(films: Sequence[Film]) -> None:
+    """Let all films begin at the first moment that all of them heard, else at their first frames; says which."""
+    heard = [onsets(film.path) if film.path.is_file() else np.zeros(0) for film in films]
+    shifts = []
+    for film, sound in zip(films, heard, strict=True):
+        shift, likeness = shift_of(heard[0], sound)
+        if likeness < SURE:
+            lacks = f" in common with {films[0].path.name}" if sound.any() and film is not films[0] else ""
+            say(
+                f"the first frames of all {len(films)} films are taken to be of one moment: {film.path.name} has no "
+                f"sound{lacks}."
+            )
+            return
+        shifts.append(shift)
+    for film, shift in zip(films, shifts, strict=True):
+        film.start = shift - min(shifts)
+    starts = ", ".join(f"{film.path.name} at {film.start:.2f} s" for film in films)
+    say(f"the films are brought into step by their sound: they begin together in {starts}.")
+
+
+def onsets(path: Path) -> Floats:
+    """(n,) how much louder the sound of a film becomes, RATE / STEP values a second from its first frame on; none where
+    it has no sound."""
+    av = import_av(path)
+    wave, late = [np.zeros(STEP)], None
+    try:
+        with av.open(str(path), metadata_errors="replace") as file:
+            picture = file.streams.video[0]
+            begin = float((picture.start_time or 0) * picture.time_base)
+            resampler = av.AudioResampler(format="flt", layout="mono", rate=RATE)
+            for frame in file.decode(audio=0) if file.streams.audio else ():
+                late = (frame.time or 0.0) - begin if late is None else late
+                wave += [part.to_ndarray()[0] for part in resampler.resample(frame)]
+    except (av.error.FFmpegError, OSError):
+        return np.zeros(0)
+    sound = np.concatenate([np.zeros(max(0, round((late or 0.0) * RATE))), *wave])
+    power = np.log(np.square(sound[: len(sound) // STEP * STEP].reshape(-1, STEP)).mean(axis=1) + 1e-8)
+    return np.maximum(np.diff(power), 0)
+
+
+def shift_of(one: Floats, other: Floats) -> tuple[float, float]:
+    """By how many seconds what is heard comes later in the other film, and by how many standard deviations the likeness
+    there stands out, 0 where one has no sound."""
+    from scipy.signal import correlate  # slow to import
+
+    if not (len(one) and len(other)):
+        return 0.0, 0.0
+    likeness = correlate(other - other.mean(), one - one.mean())
+    best = int(likeness.argmax())
+    return (best - len(one) + 1) * STEP / RATE, float(likeness[best] / max(likeness.std(), 1e-12))
