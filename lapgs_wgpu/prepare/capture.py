@@ -16,10 +16,9 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.calibration import match_names, read_calibration
 from lapgs_wgpu.prepare.capture_folder import MASKS, WORK, RefusedError, appearing
 from lapgs_wgpu.prepare.film import Film
-from lapgs_wgpu.prepare.flow import Motion, film_frames
 from lapgs_wgpu.prepare.images import Picture, extract, images_per_second
 from lapgs_wgpu.prepare.inputs import open_inputs
-from lapgs_wgpu.prepare.movers import RIM, Judged, cut_out, judge, read_masks, write_masks
+from lapgs_wgpu.prepare.movers import RIM, Judged, Motion, cut_out, film_frames, judge, read_masks, write_masks
 from lapgs_wgpu.prepare.poses import Floats, Reconstruction, import_cv2, import_pycolmap, neighbouring_pairs
 from lapgs_wgpu.prepare.rig import place_calibrated, place_still
 from lapgs_wgpu.prepare.search import Found, again, described, longest_part, search
