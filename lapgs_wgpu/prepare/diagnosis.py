@@ -18,8 +18,8 @@ from lapgs_wgpu.data.images import Pixels
 from lapgs_wgpu.data.masks import Mask, decode_mask
 from lapgs_wgpu.data.readers.colmap import IMAGES
 from lapgs_wgpu.prepare.capture_folder import MASKS
-from lapgs_wgpu.prepare.path import AROUND, STEP, TURN, path_faults
 from lapgs_wgpu.prepare.poses import Floats
+from lapgs_wgpu.prepare.search import AROUND, STEP, TURN, path_faults
 from lapgs_wgpu.progress import counted
 from lapgs_wgpu.splat.camera import Camera
 
