@@ -17,12 +17,12 @@ from lapgs_wgpu.data.focus import FAR_APART, degrees_apart
 from lapgs_wgpu.data.images import Pixels
 from lapgs_wgpu.data.masks import Mask, decode_mask
 from lapgs_wgpu.data.readers.colmap import IMAGES
-from lapgs_wgpu.prepare.capture_folder import MASKS
 from lapgs_wgpu.prepare.poses import Floats
 from lapgs_wgpu.prepare.search import AROUND, STEP, TURN, path_faults
 from lapgs_wgpu.progress import counted
 from lapgs_wgpu.splat.camera import Camera
 
+MASKS = "masks"  # folder of a capture
 SIZE = 320  # longer side of the images that are looked at, pixels
 MOST_VIEWS = 96  # of a capture that are looked at, evenly chosen over the clip
 MOST_POINTS, MOST_CAMERAS = 1500, 48  # at which, and between which, angles are measured

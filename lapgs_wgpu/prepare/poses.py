@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lapgs_wgpu.data.images import Size
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.masks import Mask
-from lapgs_wgpu.errors import optional_module
+from lapgs_wgpu.errors import InputError, optional_module
 from lapgs_wgpu.progress import counted
 
 FEATURE_SIDE = 1600  # longer side, pixels: larger images are shrunk to find features
@@ -23,6 +23,10 @@ Ints = NDArray[np.integer]
 Floats = NDArray[np.float64]
 Plane = NDArray[np.float32]
 Match = Mapping[Pair, Ints]  # of pairs of images: (m, 2) numbers of their features
+
+
+class RefusedError(InputError):
+    """Too few cameras could be placed. What was found stays."""
 
 
 class Reconstruction:
@@ -56,7 +60,7 @@ class Reconstruction:
         return self._colmap.Database.open(self._database)
 
     def match(self, pairs: Sequence[Pair], shown: Mapping[str, Sequence[str]] | None = None) -> None:
-        """Find the features of all images, match those of pairs, keep places and matches, and verify these.
+        """Find the features of all images, match those of pairs, and keep places and matches.
 
         shown: names of further images, below the same folder, for cameras that stand still: an image has the features
         of all of its own, as many for each and in the order of time, and those of one time are matched. So what moves
@@ -75,7 +79,6 @@ class Reconstruction:
                 found.append(nearest(one, other) + before)
                 before += [len(one), len(other)]
             self.matches[pair] = np.concatenate(found)
-        self.verify()
 
     def verify(self, masks: Mapping[str, Mask] | None = None) -> None:
         """Find epipolar geometries that explain many of the matches, of those outside masks alone."""

@@ -18,10 +18,9 @@ from lapgs_wgpu.data.timestamps import CAMERAS
 from lapgs_wgpu.data.video_frames import import_av
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.calibration import Calibrated, match_names, read_calibration
-from lapgs_wgpu.prepare.capture_folder import RefusedError
 from lapgs_wgpu.prepare.film import Film, Frame
 from lapgs_wgpu.prepare.images import LONGER_SIDE, Picture, spans, write_image
-from lapgs_wgpu.prepare.poses import Floats, Plane, Reconstruction, import_cv2
+from lapgs_wgpu.prepare.poses import Floats, Plane, Reconstruction, RefusedError, import_cv2
 from lapgs_wgpu.progress import say
 
 LENS = "SIMPLE_RADIAL"  # few images do not determine more parameters
@@ -102,6 +101,7 @@ def place_still(films: Sequence[Film], images: Path, fps: float, work: Path) -> 
     shown = {group[0]: group for group in groups}
     source = Reconstruction(images, list(shown), work, LENS, lenses)
     source.match(list(itertools.combinations(shown, 2)), shown)
+    source.verify()
     model = source.solve()
     placed, least = 0 if model is None else model.num_reg_images(), max(2, len(groups) // 2)
     if placed < least:
