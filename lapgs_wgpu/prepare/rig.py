@@ -171,9 +171,8 @@ def _assigned(films: Sequence[Film], calibration: Path) -> list[Calibrated]:
 def start_together(films: Sequence[Film]) -> None:
     """Let all films begin at the first moment that all of them heard, else at their first frames; says which."""
     heard = [onsets(film.path) if film.path.is_file() else np.zeros(0) for film in films]
-    shifts = []
-    for film, sound in zip(films, heard, strict=True):
-        shift, likeness = shift_of(heard[0], sound)
+    found = [shift_of(heard[0], sound) for sound in heard]
+    for film, sound, (_, likeness) in zip(films, heard, found, strict=True):
         if likeness < SURE:
             lacks = f" in common with {films[0].path.name}" if sound.any() and film is not films[0] else ""
             say(
@@ -181,9 +180,8 @@ def start_together(films: Sequence[Film]) -> None:
                 f"sound{lacks}."
             )
             return
-        shifts.append(shift)
-    for film, shift in zip(films, shifts, strict=True):
-        film.start = shift - min(shifts)
+    for film, (shift, _) in zip(films, found, strict=True):
+        film.start = shift - min(found)[0]
     starts = ", ".join(f"{film.path.name} at {film.start:.2f} s" for film in films)
     say(f"the films are brought into step by their sound: they begin together in {starts}.")
 
