@@ -19,8 +19,7 @@ from lapgs_wgpu.io.folder_lock import LOCK, locked_folder
 from lapgs_wgpu.io.listing import listed
 from lapgs_wgpu.prepare.calibration import match_names, read_calibration
 from lapgs_wgpu.prepare.diagnosis import MASKS
-from lapgs_wgpu.prepare.film import Film
-from lapgs_wgpu.prepare.images import Picture, extract, images_per_second
+from lapgs_wgpu.prepare.film import Film, Picture, extract, images_per_second
 from lapgs_wgpu.prepare.inputs import open_inputs
 from lapgs_wgpu.prepare.movers import RIM, Judged, Motion, cut_out, film_frames, judge, read_masks, write_masks
 from lapgs_wgpu.prepare.poses import (

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.data.images import Pixels, Size, encode_png
 from lapgs_wgpu.data.masks import Mask, check_mask_size, decode_mask, find_masks
-from lapgs_wgpu.prepare.film import Film
-from lapgs_wgpu.prepare.images import Picture
+from lapgs_wgpu.prepare.film import Film, Picture
 from lapgs_wgpu.prepare.poses import Floats, Plane, import_cv2
 from lapgs_wgpu.progress import Progress
 

@@ -18,8 +18,7 @@ from lapgs_wgpu.data.timestamps import CAMERAS
 from lapgs_wgpu.data.video_frames import import_av
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.calibration import Calibrated, match_names, read_calibration
-from lapgs_wgpu.prepare.film import Film, Frame
-from lapgs_wgpu.prepare.images import LONGER_SIDE, Picture, spans, write_image
+from lapgs_wgpu.prepare.film import LONGER_SIDE, Film, Frame, Picture, spans, write_image
 from lapgs_wgpu.prepare.poses import Floats, Plane, Reconstruction, RefusedError, import_cv2
 from lapgs_wgpu.progress import say
 
