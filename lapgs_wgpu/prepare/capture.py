@@ -67,8 +67,7 @@ def prepare(
     import_pycolmap()
     import_cv2()
     with appearing(out) as folder:
-        work = folder / WORK
-        films = open_inputs(inputs, work)
+        films = open_inputs(inputs, folder / WORK)
         if len(films) > 1 and (masks or poses):
             raise InputError(f"--masks and --poses go with one moving camera, and there are {len(films)} films.")
         if len(films) == 1 and calibration:
@@ -76,13 +75,12 @@ def prepare(
         rate = images_per_second(films, fps)
         if calibration is not None:
             pictures, placed = place_calibrated(films, folder, rate, calibration), len(films)
-        else:
-            if len(films) > 1:
-                pictures, model = place_still(films, folder / IMAGES, rate, work)
-            else:
-                pictures = extract(films[0], folder / IMAGES, rate)
-                model = _moving_camera(films[0], folder, pictures, masks, poses)
+        elif len(films) > 1:
+            pictures, model = place_still(films, folder / IMAGES, rate, folder / WORK)
             placed = write_model(folder, model, pictures)
+        else:
+            pictures = extract(films[0], folder / IMAGES, rate)
+            placed = write_model(folder, _moving_camera(films[0], folder, pictures, masks, poses), pictures)
     cameras = len(films) if len(films) > 1 else len(pictures)
     say(f"{out}: {len(pictures)} images, {placed} of {cameras} cameras placed")
 

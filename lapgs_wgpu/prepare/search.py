@@ -77,11 +77,11 @@ def search(source: Reconstruction, *, rival: bool = False) -> Found | None:
 
 
 def _solved(source: Reconstruction, focal: float, together: bool, held: bool, seconds: float) -> Found | None:
-    found = described(source, source.solve(focal, together=together, held=held, seconds=seconds))
-    return None if found is None else found._replace(together=together, held=held)
+    model = source.solve(focal, together=together, held=held, seconds=seconds)
+    return described(source, model, together=together, held=held)
 
 
-def described(source: Reconstruction, model: Any) -> Found | None:
+def described(source: Reconstruction, model: Any, *, together: bool = False, held: bool = False) -> Found | None:
     """A reconstruction, and what tells how good it is. None where it has no points."""
     if model is None or model.num_reg_images() < 2 or not model.num_points3D():
         return None
@@ -94,7 +94,7 @@ def described(source: Reconstruction, model: Any) -> Found | None:
     bent = camera.model.name == "RADIAL" and abs(camera.params[3]) > 0.4  # as no camera's lens is
     faults = len(path_faults(places, axes, points, placed)) + bent
     error = float(model.compute_mean_reprojection_error())
-    return Found(model, placed, faults, error, camera.mean_focal_length())
+    return Found(model, placed, faults, error, camera.mean_focal_length(), together=together, held=held)
 
 
 def panned(source: Reconstruction, pan: Pan) -> Found:
