@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lapgs_wgpu.data.images import Size, check_image
-from lapgs_wgpu.data.lens import Lens
+from lapgs_wgpu.data.lens import Array, Lens
 from lapgs_wgpu.data.readers.colmap import IMAGES, SPARSE
 from lapgs_wgpu.data.timestamps import TIMES
 from lapgs_wgpu.errors import InputError, quoted
@@ -22,14 +22,7 @@ from lapgs_wgpu.prepare.diagnosis import MASKS
 from lapgs_wgpu.prepare.film import Film, Picture, extract, images_per_second
 from lapgs_wgpu.prepare.inputs import open_inputs
 from lapgs_wgpu.prepare.movers import RIM, Judged, Motion, cut_out, film_frames, judge, read_masks, write_masks
-from lapgs_wgpu.prepare.poses import (
-    Floats,
-    Reconstruction,
-    RefusedError,
-    import_cv2,
-    import_pycolmap,
-    neighbouring_pairs,
-)
+from lapgs_wgpu.prepare.poses import Reconstruction, RefusedError, import_cv2, import_pycolmap, neighbouring_pairs
 from lapgs_wgpu.prepare.report import REPORT
 from lapgs_wgpu.prepare.rig import place_calibrated, place_still
 from lapgs_wgpu.prepare.search import Found, again, described, longest_part, search
@@ -183,7 +176,7 @@ def _moving_camera(
     return found.model
 
 
-def _known(names: Sequence[str], poses: Path, size: Size) -> dict[str, tuple[Lens, Floats]]:
+def _known(names: Sequence[str], poses: Path, size: Size) -> dict[str, tuple[Lens, Array]]:
     """Lens and pose of the images that have a camera of their name. Raises InputError."""
     cameras = read_calibration(poses)
     found = match_names(cameras, names)

@@ -15,15 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lapgs_wgpu.data.images import THUMBNAIL, Pixels, Size, blurred, repeats, sharpness, shrunk_size, size_text
-from lapgs_wgpu.data.video_frames import (
-    EXACT_COLORS,
-    INTERLACED,
-    Display,
-    display,
-    import_av,
-    opened_film,
-    pixel_aspect,
-)
+from lapgs_wgpu.data.video_frames import EXACT_COLORS, INTERLACED, display, import_av, opened_film, pixel_aspect
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.progress import counted, say
 
@@ -86,14 +78,22 @@ class Film:
         if first is None:
             raise InputError(f"{path} has no frame that can be decoded; give the recording itself.")
         self._began = first.time or 0.0
-        self.size = self._shown(first)[1]
+        self.size = self._shown(first)
         if first.interlaced_frame:
             say(f"{path}: {INTERLACED}.")
 
-    def _shown(self, frame: Any) -> tuple[Display, Size]:
-        """How a frame is shown, and its (width, height) in square pixels then: the width follows their aspect."""
+    def _shown(self, frame: Any) -> Size:
+        """(width, height) of a frame as it is shown, in square pixels."""
+        return display(frame).size((max(1, round(frame.width * self._aspect)), frame.height))
+
+    def _pixels(self, frame: Any, longer_side: int, *, gray: bool = False) -> Pixels:
+        """(H, W, 3), or (H, W) gray."""
         shape = display(frame)
-        return shape, shape.size((max(1, round(frame.width * self._aspect)), frame.height))
+        width, height = shape.size(shrunk_size(self.size, longer_side))  # not yet turned
+        transfer = None if gray else TRANSFERS.get(int(frame.color_trc))
+        form, way = ("gray", _FAST_BILINEAR) if gray else ("rgb48le" if transfer else "rgb24", EXACT_COLORS)
+        image = frame.to_ndarray(format=form, width=width, height=height, interpolation=way)
+        return shape.apply(to_sdr(image, transfer) if transfer else image)
 
     def frames(self) -> Iterator[Frame]:
         """Decode the frames in the order of their times. Raises InputError; a film that is damaged after its first
@@ -103,8 +103,7 @@ class Film:
         with opened_film(self.path) as (file, stream):
             try:
                 for frame in file.decode(stream):
-                    shape, size = self._shown(frame)
-                    if size != self.size:
+                    if (size := self._shown(frame)) != self.size:
                         raise InputError(
                             f"{self.path}: frame {number} has {size_text(size)} pixels and the first has "
                             f"{size_text(self.size)}; cut the film where its size changes."
@@ -115,8 +114,8 @@ class Film:
                     seconds = max(seconds, 0.0)
                     if seconds >= self.start - 0.5 / self.rate:
                         begin = seconds if begin is None else begin
-                        pixels = partial(_pixels, frame, shape.size(size), shape)
-                        yield Frame(seconds - begin, pixels(THUMBNAIL, gray=True).astype(np.float32), pixels)
+                        gray = self._pixels(frame, THUMBNAIL, gray=True).astype(np.float32)
+                        yield Frame(seconds - begin, gray, partial(self._pixels, frame))
                     number, last = number + 1, seconds
             except av.error.FFmpegError:
                 if number < 2:
@@ -129,15 +128,6 @@ class Film:
             say(f"{self.path} {ends}; copy it again if the rest is needed.")
         if guessed:
             say(f"{self.path}: frames without a time stamp of their own are taken as {self.rate:g} a second.")
-
-
-def _pixels(frame: Any, size: Size, shape: Display, longer_side: int, *, gray: bool = False) -> Pixels:
-    """(H, W, 3), or (H, W) gray. size: of the frame's square pixels, not yet turned."""
-    width, height = shrunk_size(size, longer_side)
-    transfer = None if gray else TRANSFERS.get(int(frame.color_trc))
-    form, way = ("gray", _FAST_BILINEAR) if gray else ("rgb48le" if transfer else "rgb24", EXACT_COLORS)
-    image = frame.to_ndarray(format=form, width=width, height=height, interpolation=way)
-    return shape.apply(to_sdr(image, transfer) if transfer else image)
 
 
 def to_sdr(image: NDArray[np.uint16], transfer: Transfer) -> Pixels:
