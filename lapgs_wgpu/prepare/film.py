@@ -131,10 +131,8 @@ class Film:
 
 
 def to_sdr(image: NDArray[np.uint16], transfer: Transfer) -> Pixels:
-    """(H, W, 3) uint16 R'G'B' of ITU-R BT.2100 -> (H, W, 3) uint8 sRGB.
-
-    A display of the web shows HDR's reference white at full level: light above the knee is rolled off.
-    """
+    """(H, W, 3) uint16 R'G'B' of ITU-R BT.2100 -> (H, W, 3) uint8 sRGB, which shows the reference white at full
+    level."""
     signal = np.linspace(0, 1, 4096)  # 12 bits, more than films have
     if transfer == "HLG":  # relative light of the scene, by whose brightness the display changes it
         a, b, c = 0.17883277, 0.28466892, 0.55991073
@@ -168,11 +166,8 @@ def images_per_second(films: Sequence[Film], asked: float | None) -> float:
 
 
 def extract(film: Film, images: Path, fps: float) -> list[Picture]:
-    """Write the images of a camera that moves, at most `fps` a second, whose names are their files', else their times
-    in milliseconds.
-
-    Raises InputError for a film that is black or gives less than 2 images.
-    """
+    """Write the images of a camera that moves, at most `fps` a second; of films, named by milliseconds. Raises
+    InputError for a film that is black or gives less than 2 images."""
     pictures, sharp, repeated, before = list[Picture](), list[float](), 0, None
     for _, frames in spans(film, fps):
         best = max(frames, key=lambda frame: sharpness(frame.gray))

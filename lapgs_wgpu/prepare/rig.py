@@ -44,10 +44,8 @@ class Shape(NamedTuple):
 
 
 def shapes_of(films: Sequence[Film]) -> list[Shape]:
-    """How each camera's frames get the size of all images.
-
-    Raises InputError for films of so different proportions that more than half of one would be cut off.
-    """
+    """How each camera's frames get the size of all images. Raises InputError where more than half of one would be cut
+    off."""
     sizes = [shrunk_size(film.size, LONGER_SIDE) for film in films]
     width, height = np.min(sizes, axis=0).tolist()
     shapes = []
@@ -68,11 +66,8 @@ def shapes_of(films: Sequence[Film]) -> list[Shape]:
 def extract_in_step(
     films: Sequence[Film], images: Path, fps: float, shapes: Sequence[Shape]
 ) -> list[dict[int, Picture]]:
-    """Write the images of cameras that stand still, below cam00, cam01, ...: by the number of their span of time, which
-    is that of the other cameras' images of this time.
-
-    None is left out, and all films end with the shortest.
-    """
+    """Write all images of cameras that stand still, below cam00, cam01, ..., as long as the shortest film: by the
+    number of their span of time, which is that of the other cameras' images of this time."""
     start_together(films)
     cameras = []
     for number, (film, shape) in enumerate(zip(films, shapes, strict=True)):
