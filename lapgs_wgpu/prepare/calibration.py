@@ -39,8 +39,7 @@ class Calibrated(NamedTuple):
     sized: bool = True
 
     def lens_for(self, size: Size, of: Size | None = None) -> Lens:
-        """The lens for images of `size`, which are those of a film of size `of`. Raises InputError where the file
-        states other proportions."""
+        """The lens for images of `size`, of a film of size `of`. Raises InputError for proportions not the file's."""
         width, height = of or size
         if not self.sized:
             return replace(self.lens, width=width, height=height).resized(*size)

@@ -131,8 +131,7 @@ class Film:
 
 
 def to_sdr(image: NDArray[np.uint16], transfer: Transfer) -> Pixels:
-    """(H, W, 3) uint16 R'G'B' of ITU-R BT.2100 -> (H, W, 3) uint8 sRGB, which shows the reference white at full
-    level."""
+    """(H, W, 3) uint16 R'G'B' of ITU-R BT.2100 -> (H, W, 3) uint8 sRGB, whose full level is the reference white."""
     signal = np.linspace(0, 1, 4096)  # 12 bits, more than films have
     if transfer == "HLG":  # relative light of the scene, by whose brightness the display changes it
         a, b, c = 0.17883277, 0.28466892, 0.55991073

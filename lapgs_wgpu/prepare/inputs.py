@@ -70,8 +70,7 @@ def _pixels(image: Image.Image, longer_side: int) -> Pixels:
 
 
 def _opened_image(file: Path) -> Image.Image:
-    """An image of any kind that a reader is installed for, upright; of EXIF's tags, info["exif"] keeps the focal length
-    alone. Raises InputError."""
+    """An image of any kind that has a reader, upright; info["exif"] keeps the focal length alone. Raises InputError."""
     with suppress(ImportError):
         import_module(HEIC).register_heif_opener()
     try:
@@ -87,8 +86,7 @@ def _opened_image(file: Path) -> Image.Image:
 
 
 def open_inputs(paths: Sequence[Path], work: Path) -> list[Film]:
-    """The cameras of films, images, folders, patterns (*.jpg) and zip files. work: where these are unpacked. Raises
-    InputError."""
+    """The cameras of films, images, folders, patterns (*.jpg) and zip files, unpacked in `work`. Raises InputError."""
     named: list[Path] = []
     for path in paths:
         found = sorted(glob(str(path)), key=natural_key) if not path.exists() else []

@@ -77,8 +77,7 @@ def _residuals(pairs: Ints, at: Floats, R: Floats, focal: float, radial: float) 
 
 
 def _chained(pairs: Ints, at: Floats, count: int, focal: float, sigma: float) -> Floats:
-    """(n, 3, 3) rotations, each from one of the 3 images before: that with the least sum of distances (Kabsch 1976,
-    reweighted)."""
+    """(n, 3, 3) rotations, each from one of the 3 before, of least sum of distances (Kabsch 1976, reweighted)."""
     rotations = np.tile(np.eye(3), (count, 1, 1))
     for image in range(1, count):
         rotations[image] = rotations[image - 1]

@@ -44,8 +44,7 @@ class Shape(NamedTuple):
 
 
 def shapes_of(films: Sequence[Film]) -> list[Shape]:
-    """How each camera's frames get the size of all images. Raises InputError where more than half of one would be cut
-    off."""
+    """How each camera's frames get the size of all images. Raises InputError where that cuts off more than half."""
     sizes = [shrunk_size(film.size, LONGER_SIDE) for film in films]
     width, height = np.min(sizes, axis=0).tolist()
     shapes = []
