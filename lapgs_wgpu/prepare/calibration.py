@@ -70,7 +70,7 @@ def read_calibration(path: Path) -> dict[str, Calibrated]:
         (_opencv, b"YAML" in head),
     )
     try:
-        cameras = next((dict(read(path)) for read, applies in formats if head and applies), {})
+        cameras: dict[str, Calibrated] = next((dict(read(path)) for read, applies in formats if head and applies), {})
     except InputError:
         raise
     except (SyntaxError, TypeError, ValueError) as error:  # of XML, numbers, arrays

@@ -87,7 +87,7 @@ class Motion:
         return found
 
 
-def _at(values: Plane, at: Plane) -> Plane:
+def _at(values: Plane, at: NDArray[np.floating]) -> Plane:
     cv2 = import_cv2()
     x, y = (np.ascontiguousarray(np.nan_to_num(at[..., i], nan=-9.0), dtype=np.float32) for i in (0, 1))
     return cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(np.nan,) * 4)
