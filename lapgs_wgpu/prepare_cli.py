@@ -101,7 +101,7 @@ def check_options(given: argparse.Namespace) -> None:
 
 def _convert(given: argparse.Namespace) -> None:
     from lapgs_wgpu.prepare.capture import prepare  # after --help: numpy and Pillow take a while
-    from lapgs_wgpu.prepare.capture_folder import RefusedError
+    from lapgs_wgpu.prepare.poses import RefusedError
     from lapgs_wgpu.prepare.report import write_refusal
 
     chosen = {name: getattr(given, name) for name in ("fps", "masks", "poses", "calibration")}
@@ -114,9 +114,8 @@ def _convert(given: argparse.Namespace) -> None:
 
 def _measure(folder: Path) -> Diagnosis:
     """Print what a capture is worth, and write the report into its folder."""
-    from lapgs_wgpu.prepare.capture_folder import REPORT
     from lapgs_wgpu.prepare.diagnosis import diagnose
-    from lapgs_wgpu.prepare.report import write_report
+    from lapgs_wgpu.prepare.report import REPORT, write_report
 
     diagnosis = diagnose(folder)
     print(f"{folder}: {diagnosis}", flush=True)

@@ -14,8 +14,7 @@ from PIL import Image
 from lapgs_wgpu import prepare_cli
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.prepare.capture import prepare
-from lapgs_wgpu.prepare.capture_folder import appearing
+from lapgs_wgpu.prepare.capture import appearing, prepare
 from lapgs_wgpu.prepare.poses import neighbouring_pairs
 from lapgs_wgpu.prepare_cli import prepare_command
 

@@ -12,11 +12,8 @@ from PIL import Image
 
 from lapgs_wgpu.data.video_frames import display
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.prepare.film import Film
-from lapgs_wgpu.prepare.hdr import Transfer, to_sdr
-from lapgs_wgpu.prepare.images import Picture, extract, extract_in_step, images_per_second
-from lapgs_wgpu.prepare.rig import common_times, shapes_of
-from lapgs_wgpu.prepare.sound import start_together
+from lapgs_wgpu.prepare.film import Film, Picture, Transfer, extract, images_per_second, to_sdr
+from lapgs_wgpu.prepare.rig import common_times, extract_in_step, shapes_of, start_together
 
 av = pytest.importorskip("av")
 
@@ -111,7 +108,7 @@ def test_the_sharpest_frame_of_each_span(tmp_path: Path, monkeypatch: pytest.Mon
     pictures = noise_pictures(12)
     soft = [p if i % 3 == 1 else np.full_like(p, p.mean()) // 2 + p // 2 for i, p in enumerate(pictures)]
     film = Film(write_film(tmp_path / "film.mkv", soft))
-    monkeypatch.setattr("lapgs_wgpu.prepare.images.LONGER_SIDE", 32)
+    monkeypatch.setattr("lapgs_wgpu.prepare.film.LONGER_SIDE", 32)
     found = extract(film, tmp_path, 10)
     assert [picture.name for picture in found] == [f"{round(100 * i + 33.3):08d}.jpg" for i in range(4)]
     assert sorted(path.name for path in tmp_path.glob("*.jpg")) == [picture.name for picture in found]

@@ -13,8 +13,7 @@ from PIL import Image
 from lapgs_wgpu.data.images import encode_png
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.capture import prepare
-from lapgs_wgpu.prepare.flow import Motion
-from lapgs_wgpu.prepare.movers import RIM, Judged, depth_errors, read_masks
+from lapgs_wgpu.prepare.movers import RIM, Judged, Motion, depth_errors, read_masks
 from lapgs_wgpu.prepare.poses import in_mask, without
 
 pycolmap = pytest.importorskip("pycolmap")

@@ -11,11 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.prepare.capture import prepare
-from lapgs_wgpu.prepare.images import images_per_second
+from lapgs_wgpu.prepare.film import images_per_second
 from lapgs_wgpu.prepare.pan import rays, solve_pan
-from lapgs_wgpu.prepare.path import path_faults
 from lapgs_wgpu.prepare.poses import nearest
-from lapgs_wgpu.prepare.search import longest_part
+from lapgs_wgpu.prepare.search import longest_part, path_faults
 from lapgs_wgpu.splat.camera import Camera
 
 pytest.importorskip("av")

@@ -25,10 +25,6 @@ from lapgs_wgpu.data.readers.transforms import read_lens
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io import safe_json_toml
 
-FORMATS = (
-    "COLMAP's cameras and images, nerfstudio's transforms.json, .qca.txt of Qualisys, .toml of Pose2Sim, .yml of "
-    "OpenCV, .json of Panoptic"
-)
 SAME = 0.01  # by so much the proportions of images may differ from those that a file states
 _MATRIX = re.compile(r"^(\w+):\s*!!opencv-matrix\s+rows:.*\s+cols:.*\s+dt:.*\s+data:\s*\[([^\]]*)\]", re.MULTILINE)
 _STEREO = {"M1": "K_1", "D1": "dist_1", "M2": "K_2", "D2": "dist_2", "R": "Rot_2", "T": "T_2"}
@@ -43,8 +39,7 @@ class Calibrated(NamedTuple):
     sized: bool = True
 
     def lens_for(self, size: Size, of: Size | None = None) -> Lens:
-        """The lens for images of `size`, which are those of a film of size `of`. Raises InputError where the file
-        states other proportions."""
+        """The lens for images of `size`, of a film of size `of`. Raises InputError for proportions not the file's."""
         width, height = of or size
         if not self.sized:
             return replace(self.lens, width=width, height=height).resized(*size)
@@ -68,38 +63,39 @@ def read_calibration(path: Path) -> dict[str, Calibrated]:
     inside = [path / "transforms.json", path / "intri.yml"]
     path = next((file for file in inside if file.is_file()), path)
     head = path.read_bytes()[:200].lstrip() if path.is_file() else b""
-    cameras: dict[str, Calibrated] = {}
+    formats = (
+        (_json, path.suffix == ".json"),
+        (_qualisys, head.startswith(b"<")),
+        (_toml, path.suffix == ".toml"),
+        (_opencv, b"YAML" in head),
+    )
     try:
-        if path.suffix == ".json" and head:
-            data = read_json(path)
-            cameras = dict(_panoptic(data) if "cameras" in data else _nerfstudio(data))
-        elif head.startswith(b"<"):
-            cameras = dict(_qualisys(path))
-        elif path.suffix == ".toml" and head:
-            cameras = dict(_toml(path))
-        elif b"YAML" in head:
-            cameras = dict(_opencv(path))
+        cameras: dict[str, Calibrated] = next((dict(read(path)) for read, applies in formats if head and applies), {})
     except InputError:
         raise
     except (SyntaxError, TypeError, ValueError) as error:  # of XML, numbers, arrays
         raise InputError(f"{path} cannot be read ({str(error)[:80]}); export it again.") from None
     if not cameras:
         state = "holds no cameras in a known format" if path.exists() else "does not exist"
-        raise InputError(f"{path} {state}: cameras are read from {FORMATS}.")
+        raise InputError(
+            f"{path} {state}: cameras are read from COLMAP's cameras and images, nerfstudio's transforms.json, "
+            ".qca.txt of Qualisys, .toml of Pose2Sim, .yml of OpenCV, .json of Panoptic."
+        )
     return cameras
 
 
-def _nerfstudio(data: Fields) -> Iterator[Named]:
+def _json(path: Path) -> Iterator[Named]:
+    """Of Panoptic or nerfstudio."""
+    data = read_json(path)
+    if "cameras" in data:
+        for entry in data.objects("cameras", "camera"):
+            yield _tabled(entry, str(entry.required("name")), "K", "distCoef", "R", "t", "resolution")
+        return
     for entry in data.objects("frames", "frame"):
         name = str(entry.required("file_path"))
         width, height = ((entry if side in entry else data).side(side) for side in "wh")
         lens, _ = read_lens(entry, data, ImageFile(Path(name), (width, height)))
         yield name, Calibrated(lens, opengl_pose(entry.required("transform_matrix"), entry.where), entry.where)
-
-
-def _panoptic(data: Fields) -> Iterator[Named]:
-    for entry in data.objects("cameras", "camera"):
-        yield _tabled(entry, str(entry.required("name")), "K", "distCoef", "R", "t", "resolution")
 
 
 def _toml(path: Path) -> Iterator[Named]:

@@ -1,26 +1,29 @@
-"""The whole way from films to a capture: images, poses, masks of what moves."""
+"""The whole way from films to a capture: images, poses, masks of what moves, and the folder in which all appears."""
 
 import itertools
 import json
-from collections.abc import Sequence
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lapgs_wgpu.data.images import Size, check_image
-from lapgs_wgpu.data.lens import Lens
+from lapgs_wgpu.data.lens import Array, Lens
 from lapgs_wgpu.data.readers.colmap import IMAGES, SPARSE
 from lapgs_wgpu.data.timestamps import TIMES
-from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.errors import InputError, quoted
+from lapgs_wgpu.io.folder_lock import LOCK, locked_folder
+from lapgs_wgpu.io.listing import listed
 from lapgs_wgpu.prepare.calibration import match_names, read_calibration
-from lapgs_wgpu.prepare.capture_folder import MASKS, WORK, RefusedError, appearing
-from lapgs_wgpu.prepare.film import Film
-from lapgs_wgpu.prepare.flow import Motion, film_frames
-from lapgs_wgpu.prepare.images import Picture, extract, images_per_second
+from lapgs_wgpu.prepare.diagnosis import MASKS
+from lapgs_wgpu.prepare.film import Film, Picture, extract, images_per_second
 from lapgs_wgpu.prepare.inputs import open_inputs
-from lapgs_wgpu.prepare.movers import RIM, Judged, cut_out, judge, read_masks, write_masks
-from lapgs_wgpu.prepare.poses import Floats, Reconstruction, import_cv2, import_pycolmap, neighbouring_pairs
+from lapgs_wgpu.prepare.movers import RIM, Judged, Motion, cut_out, film_frames, judge, read_masks, write_masks
+from lapgs_wgpu.prepare.poses import Reconstruction, RefusedError, import_cv2, import_pycolmap, neighbouring_pairs
+from lapgs_wgpu.prepare.report import REPORT
 from lapgs_wgpu.prepare.rig import place_calibrated, place_still
 from lapgs_wgpu.prepare.search import Found, again, described, longest_part, search
 from lapgs_wgpu.progress import say
@@ -30,6 +33,7 @@ LENS = "RADIAL"
 FEWEST = 0.3  # of the images need a pose
 LITTLE, MUCH = 0.002, 0.15  # share of the images: less motion needs no masks; more may have led the cameras astray
 FEATURES, SHARED = 200, 60  # of an image; in common with the next one: wanted at least
+UNFINISHED, WORK, REFUSED = ".unfinished", "work", "refused.txt"
 
 
 def prepare(
@@ -56,8 +60,7 @@ def prepare(
     import_pycolmap()
     import_cv2()
     with appearing(out) as folder:
-        work = folder / WORK
-        films = open_inputs(inputs, work)
+        films = open_inputs(inputs, folder / WORK)
         if len(films) > 1 and (masks or poses):
             raise InputError(f"--masks and --poses go with one moving camera, and there are {len(films)} films.")
         if len(films) == 1 and calibration:
@@ -65,15 +68,60 @@ def prepare(
         rate = images_per_second(films, fps)
         if calibration is not None:
             pictures, placed = place_calibrated(films, folder, rate, calibration), len(films)
-        else:
-            if len(films) > 1:
-                pictures, model = place_still(films, folder / IMAGES, rate, work)
-            else:
-                pictures = extract(films[0], folder / IMAGES, rate)
-                model = _moving_camera(films[0], folder, pictures, masks, poses)
+        elif len(films) > 1:
+            pictures, model = place_still(films, folder / IMAGES, rate, folder / WORK)
             placed = write_model(folder, model, pictures)
+        else:
+            pictures = extract(films[0], folder / IMAGES, rate)
+            placed = write_model(folder, _moving_camera(films[0], folder, pictures, masks, poses), pictures)
     cameras = len(films) if len(films) > 1 else len(pictures)
     say(f"{out}: {len(pictures)} images, {placed} of {cameras} cameras placed")
+
+
+@contextmanager
+def appearing(out: Path) -> Iterator[Path]:
+    """A folder to write to, whose contents move to `out` if the block ends without an exception.
+
+    The folder is made inside `out`, so `out` may be the current folder, a link or a mount. An exception removes the
+    folder, and `out` too if it is new. Raises InputError if `out` is not empty, if another process writes to it, or if
+    the contents cannot be moved: then they stay, and the error says where. What a refused capture left in `out` is
+    replaced, and stays until then.
+    """
+    partial, refused = out / UNFINISHED, ""
+    with locked_folder(out, "lapgs-prepare"):
+        if not (out / REFUSED).is_file() and {entry.name for entry in listed(out)} - {UNFINISHED, LOCK}:
+            raise InputError(
+                f"{out} is not empty; name a new folder with --out, or, if it is a capture, measure it by "
+                f"lapgs-prepare --check {quoted(out)}, with --train to train on it."
+            )
+        shutil.rmtree(partial, ignore_errors=True)  # of a process that was killed
+        partial.mkdir()
+        try:
+            yield partial
+        except RefusedError as error:
+            refused = str(error)
+            (partial / REFUSED).write_text(refused, encoding="utf-8")
+        except BaseException:
+            shutil.rmtree(partial, ignore_errors=True)
+            raise
+        try:
+            shutil.rmtree(partial / WORK, ignore_errors=True)
+            if (out / REFUSED).is_file():
+                for name in (IMAGES, SPARSE, TIMES, MASKS, REPORT, REFUSED):
+                    shutil.rmtree(out / name) if (out / name).is_dir() else (out / name).unlink(missing_ok=True)
+            for child in sorted(partial.iterdir()):
+                child.replace(out / child.name)
+            partial.rmdir()
+        except OSError as error:
+            raise InputError(
+                f"{partial} holds the finished capture, which could not be moved to {out} ({error.strerror or error}); "
+                "move what is in it to a folder of your choice."
+            ) from None
+        if refused:
+            raise RefusedError(
+                f"{refused} Images and what was found stay in {out}: the same command goes on there, with --masks or "
+                "--poses for these images if you have any."
+            )
 
 
 def write_model(folder: Path, model: Any, pictures: Sequence[Picture]) -> int:
@@ -96,8 +144,7 @@ def _moving_camera(
     lenses = "SINGLE" if len({lens for lens, _ in known.values()}) < 2 else "PER_IMAGE"
     source = Reconstruction(folder / IMAGES, names, folder / WORK, "OPENCV" if known else LENS, lenses)
     source.match(neighbouring_pairs(names))
-    if moving is not None:
-        source.verify(moving)
+    source.verify(moving)
     found = described(source, source.given(known)) if known else search(source)
     if found is None or len(found.placed) < (0 if known else round(FEWEST * len(names))):
         raise _refusal(source, found, folder, pictures)
@@ -129,7 +176,7 @@ def _moving_camera(
     return found.model
 
 
-def _known(names: Sequence[str], poses: Path, size: Size) -> dict[str, tuple[Lens, Floats]]:
+def _known(names: Sequence[str], poses: Path, size: Size) -> dict[str, tuple[Lens, Array]]:
     """Lens and pose of the images that have a camera of their name. Raises InputError."""
     cameras = read_calibration(poses)
     found = match_names(cameras, names)

@@ -17,12 +17,12 @@ from lapgs_wgpu.data.focus import FAR_APART, degrees_apart
 from lapgs_wgpu.data.images import Pixels
 from lapgs_wgpu.data.masks import Mask, decode_mask
 from lapgs_wgpu.data.readers.colmap import IMAGES
-from lapgs_wgpu.prepare.capture_folder import MASKS
-from lapgs_wgpu.prepare.path import AROUND, STEP, TURN, path_faults
 from lapgs_wgpu.prepare.poses import Floats
+from lapgs_wgpu.prepare.search import AROUND, STEP, TURN, path_faults
 from lapgs_wgpu.progress import counted
 from lapgs_wgpu.splat.camera import Camera
 
+MASKS = "masks"  # folder of a capture
 SIZE = 320  # longer side of the images that are looked at, pixels
 MOST_VIEWS = 96  # of a capture that are looked at, evenly chosen over the clip
 MOST_POINTS, MOST_CAMERAS = 1500, 48  # at which, and between which, angles are measured
@@ -190,7 +190,12 @@ def spacing(cameras: Sequence[Camera], focus: Floats) -> Measure:
 
 def exposure(looks: Sequence[Look], points: Floats) -> Measure:
     """How the same points (n, 3) of the cloud change in brightness: stops between the images, 5 to 95 % of them."""
-    levels = np.stack([_stops(look, points) for look in looks])
+    levels = np.full((len(looks), len(points)), np.nan)
+    for stops_of, (view, image, _) in zip(levels, looks, strict=True):
+        _, seen = in_view(points, view.camera)
+        pixels, _ = view.camera.project(points[seen])
+        column, row = np.clip(np.floor(pixels).astype(np.int64), 0, [view.camera.width - 1, view.camera.height - 1]).T
+        stops_of[seen] = np.log2(np.maximum((_gray(image)[row, column] / 255) ** 2.2, 1e-3))
     levels = levels[:, np.isfinite(levels).any(axis=0)]
     levels -= np.nanmedian(levels, axis=0)
     gains = [np.nanmedian(row) for row in levels if np.isfinite(row).sum() >= POINTS_SEEN]
@@ -202,16 +207,6 @@ def exposure(looks: Sequence[Look], points: Floats) -> Measure:
     value = f"changes by {stops:.2f} stops between dark and bright images"
     advice = "lock exposure and white balance; --train corrects each image's colors"
     return measure._replace(number=stops, value=value, advice=advice)
-
-
-def _stops(look: Look, points: Floats) -> Floats:
-    """(n,) brightness at the points, NaN where they are out of view."""
-    camera, values = look.view.camera, np.full(len(points), np.nan)
-    _, seen = in_view(points, camera)
-    pixels, _ = camera.project(points[seen])
-    column, row = np.clip(np.floor(pixels).astype(np.int64), 0, [camera.width - 1, camera.height - 1]).T
-    values[seen] = np.log2(np.maximum((_gray(look.image)[row, column] / 255) ** 2.2, 1e-3))
-    return values
 
 
 def _gray(image: Pixels) -> NDArray[np.float32]:

@@ -45,25 +45,24 @@ class Stills(Film):
             unit = 1 / NUMBERED
             say(f"{self.path}: numbers in the names count images of {NUMBERED:g} a second.")
         order = np.argsort(times, kind="stable")
-        self._files = [files[i] for i in order]
-        self._times = unit * (np.array(times)[order] - min(times))
-        steps = np.diff(self._times)
-        self.seconds, self.rate = float(self._times[-1]), 1 / float(min(steps[steps > 0], default=1.0))
-        self.size = _opened_image(self._files[0]).size
+        seconds = unit * (np.array(times)[order] - min(times))
+        self._files = [(files[i], time) for i, time in zip(order, seconds.tolist(), strict=True)]
+        steps = np.diff(seconds)
+        self.seconds, self.rate = float(seconds[-1]), 1 / float(min(steps[steps > 0], default=1.0))
+        self.size = _opened_image(self._files[0][0]).size
 
     def frames(self) -> Iterator[Frame]:
         """Decode the images. Raises InputError for one that cannot be read, or has another size than the first."""
-        for file, seconds in zip(self._files, self._times.tolist(), strict=True):
+        for file, seconds in self._files:
             image = _opened_image(file)
             if image.size != self.size:
                 raise InputError(
-                    f"{file} is {size_text(image.size)} pixels and {self._files[0]} is {size_text(self.size)}; put the "
-                    "images of each camera into a folder of their own, or leave out those that differ."
+                    f"{file} is {size_text(image.size)} pixels and {self._files[0][0]} is {size_text(self.size)}; put "
+                    "the images of each camera into a folder of their own, or leave out those that differ."
                 )
             gray = image.convert("L")
             gray.thumbnail((THUMBNAIL, THUMBNAIL), Image.Resampling.BOX)
-            thumbnail = np.asarray(gray, np.float32)
-            yield Frame(seconds, thumbnail, partial(_pixels, image), file.stem, image.info["exif"])
+            yield Frame(seconds, np.asarray(gray, np.float32), partial(_pixels, image), file.stem, image.info["exif"])
 
 
 def _pixels(image: Image.Image, longer_side: int) -> Pixels:
@@ -71,8 +70,7 @@ def _pixels(image: Image.Image, longer_side: int) -> Pixels:
 
 
 def _opened_image(file: Path) -> Image.Image:
-    """An image of any kind that a reader is installed for, upright; of EXIF's tags, info["exif"] keeps the focal length
-    alone. Raises InputError."""
+    """An image of any kind that has a reader, upright; info["exif"] keeps the focal length alone. Raises InputError."""
     with suppress(ImportError):
         import_module(HEIC).register_heif_opener()
     try:
@@ -88,8 +86,7 @@ def _opened_image(file: Path) -> Image.Image:
 
 
 def open_inputs(paths: Sequence[Path], work: Path) -> list[Film]:
-    """The cameras of films, images, folders, patterns (*.jpg) and zip files. work: where these are unpacked. Raises
-    InputError."""
+    """The cameras of films, images, folders, patterns (*.jpg) and zip files, unpacked in `work`. Raises InputError."""
     named: list[Path] = []
     for path in paths:
         found = sorted(glob(str(path)), key=natural_key) if not path.exists() else []

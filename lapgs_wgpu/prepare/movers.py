@@ -4,20 +4,28 @@ A place that is followed through the images around it is explained if one depth,
 point on its whole way, as exactly as the film's noise allows. So a camera that turns on the spot needs no depth, and
 one that walks leaves only what moves along the rays of its own path undecided. Neighbouring images vote, along the
 flow; colors then draw the border (GrabCut: Rother, Kolmogorov, Blake 2004).
+
+Flow: DIS (Kroeger et al., "Fast optical flow using dense inverse search", 2016) of OpenCV, between neighbouring frames,
+chained from image to image. A place is lost where the flow forth and back do not meet.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.images import Size, encode_png
+from lapgs_wgpu.data.images import Pixels, Size, encode_png
 from lapgs_wgpu.data.masks import Mask, check_mask_size, decode_mask, find_masks
-from lapgs_wgpu.prepare.flow import REACH, Motion
+from lapgs_wgpu.prepare.film import Film, Picture
 from lapgs_wgpu.prepare.poses import Floats, Plane, import_cv2
+from lapgs_wgpu.progress import Progress
 
+SIDE = 480  # longer side of the images that are followed, pixels
+STEP = 4  # pixels between the places that are followed
+REACH = 6  # images, to either side
+MEET, MEET_SHARE = 1.5, 0.05  # pixels between a place and its way forth and back, and more by this share of the way
 NOISE, NOISE_GROWS = 0.15, 0.05  # pixels of flow, at least: between neighbouring images; for each further one
 MOST = 30.0  # times the noise: larger errors are equal
 FEWEST = 2  # images around one, in which a place must be followed
@@ -25,6 +33,79 @@ MOVES = 5.0  # times the noise, at least: it moves
 HALO = 1.5  # times the error that parts what moves from the rest: flow bends around what moves
 SHARP = 2.5  # times the noise of the better of two reconstructions: it agrees
 RIM = np.pad(np.ones((42, 42), bool), 9)  # mask of all but an image's rim, which seldom shows what moves
+
+
+class Motion:
+    """The flow of a film. names: of its pictures. images: (h, w, 3) RGB, SIDE pixels at most, one of each picture.
+    grid: (rows, columns, 2) the places of an image that are followed, pixels. tracks: of each image, where its grid is
+    in the images around it, by their offsets; NaN where it is lost."""
+
+    def __init__(self, frames: Iterable[tuple[Pixels, bool]], names: Sequence[str]) -> None:
+        """frames: small images of equal size in order, the first being a picture, and whether each is one."""
+        cv2 = import_cv2()
+        dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        dis.setFinestScale(1)
+        self.names = names
+        self.images: list[Pixels] = []
+        flows: list[list[NDArray[np.float16]]] = []  # from each picture to the next one, and back
+        before: Any = None
+        flow: list[Plane] = []  # forth and back, from the last picture on
+        with Progress(len(names), "images followed") as progress:
+            for image, chosen in frames:
+                gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+                if before is not None:
+                    there, again = dis.calc(before, gray, None), dis.calc(gray, before, None)
+                    if flow:
+                        pixels = np.stack(np.meshgrid(*map(np.arange, gray.shape[::-1])), axis=-1).astype(np.float32)
+                        there, again = flow[0] + _at(there, pixels + flow[0]), again + _at(flow[1], pixels + again)
+                    flow = [there, again]
+                before = gray
+                if chosen:
+                    if self.images:
+                        flows.append([way.astype(np.float16) for way in flow])
+                    self.images.append(image)
+                    flow = []
+                    progress.at(len(self.images))
+        height, width = self.images[0].shape[:2]
+        places = np.meshgrid(np.arange(STEP // 2, width, STEP), np.arange(STEP // 2, height, STEP))
+        self.grid: Plane = np.stack(places, axis=-1).astype(np.float32)
+        back = [flow[::-1] for flow in flows]
+        self.tracks = [
+            self._ways(flows[i : i + REACH], 1) | self._ways(back[max(i - REACH, 0) : i][::-1], -1)
+            for i in range(len(self.images))
+        ]
+
+    def _ways(self, flows: Sequence[Sequence[NDArray[np.float16]]], way: int) -> dict[int, Plane]:
+        """The grid in images 1, 2, ... times `way` away. flows: from each of these to the next one, and back."""
+        found, at = {}, self.grid
+        for offset, (there, again) in enumerate(flows, start=1):
+            step = _at(there.astype(np.float32), at)
+            on = at + step
+            apart = np.linalg.norm(step + _at(again.astype(np.float32), on), axis=-1)
+            on[~(apart < MEET + MEET_SHARE * np.linalg.norm(step, axis=-1))] = np.nan
+            found[way * offset] = at = on
+        return found
+
+
+def _at(values: Plane, at: NDArray[np.floating]) -> Plane:
+    cv2 = import_cv2()
+    x, y = (np.ascontiguousarray(np.nan_to_num(at[..., i], nan=-9.0), dtype=np.float32) for i in (0, 1))
+    return cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(np.nan,) * 4)
+
+
+def film_frames(film: Film, pictures: Sequence[Picture]) -> Iterator[tuple[Pixels, bool]]:
+    """Small frames of a film from its first picture to its last, at most 4 steps from one to the next."""
+    times = [picture.seconds for picture in pictures]
+    number, last = 0, 0.0
+    for frame in film.frames():
+        chosen = abs(frame.seconds - times[number]) < 1e-6
+        span = times[number] - times[number - 1] if number else 0.0
+        if chosen or (number and frame.seconds - last >= span / 4 - 1e-6):
+            yield np.ascontiguousarray(frame.pixels(SIDE)), chosen
+            last = frame.seconds
+        number += chosen
+        if number == len(times):
+            return
 
 
 class Judged(NamedTuple):
@@ -149,7 +230,8 @@ def _votes(motion: Motion, errors: Plane) -> Plane:
     with more weight."""
     logs, result = np.log(np.maximum(errors, 0.5)), []
     for i, own in enumerate(logs):
-        ways = {0: own} | {k: motion.on_grid(logs[i + k], at) for k, at in motion.tracks[i].items() if abs(k) <= 4}
+        near = {k: (at - STEP // 2) / STEP for k, at in motion.tracks[i].items() if abs(k) <= 4}
+        ways = {0: own} | {k: _at(logs[i + k], at) for k, at in near.items()}
         votes = np.stack(list(ways.values()))
         weight = np.isfinite(votes) / (1.0 + np.abs(list(ways)))[:, None, None]
         with np.errstate(invalid="ignore"):  # NaN where no image tells

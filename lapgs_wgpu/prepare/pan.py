@@ -30,15 +30,6 @@ class Pan(NamedTuple):
     travel: float
 
 
-class _Sample(NamedTuple):
-    """Matches: image numbers a and b (m,), a before b, and places (m, 2) in pixels from the middle of the image."""
-
-    a: Ints
-    b: Ints
-    at_a: Floats
-    at_b: Floats
-
-
 def solve_pan(
     names: Sequence[str], places: Mapping[str, Plane], matches: Match, size: Size, focal: float
 ) -> Pan | None:
@@ -48,15 +39,16 @@ def solve_pan(
     """
     if sum(len(m) for m in matches.values()) < 8 * len(names):
         return None
-    rng, middle, parts = np.random.default_rng(0), np.array(size) / 2, []
-    for (one, other), m in matches.items():
+    rng, parts = np.random.default_rng(0), []
+    for pair, m in matches.items():
         m = m[rng.permutation(len(m))[:MATCHES]]
-        ends = np.tile([names.index(one), names.index(other)], (len(m), 1))
-        parts.append((*ends.T, places[one][m[:, 0], :2] - middle, places[other][m[:, 1], :2] - middle))
-    sample = _Sample(*map(np.concatenate, zip(*parts, strict=True)))
+        ends = [places[name][m[:, i], :2] - np.array(size) / 2 for i, name in enumerate(pair)]
+        parts.append((np.tile([names.index(name) for name in pair], (len(m), 1)), np.stack(ends, axis=1)))
+    pairs, at = map(np.concatenate, zip(*parts, strict=True))
     sigma = SIGMA * max(size)
-    rotations, focal, radial, error = _refined(sample, _chained(sample, len(names), focal, sigma), focal, sigma)
-    far = sample.b - sample.a >= FAR
+    chained = _chained(pairs, at, len(names), focal, sigma)
+    rotations, focal, radial, error = _refined(pairs, at, chained, focal, sigma)
+    far = pairs[:, 1] - pairs[:, 0] >= FAR
     fits = error < FIT * max(size)
     axes = rotations[:, 2]
     turn = float(np.arccos(np.clip((axes @ axes.T).min(), -1, 1)))
@@ -72,25 +64,28 @@ def rays(places: Floats, focal: float, radial: float) -> Floats:
     return np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
 
 
-def _residuals(s: _Sample, R: Floats, focal: float, radial: float) -> tuple[Floats, Floats, Floats]:
-    """Rays in the first image (m, 3), the same seen by the second one, and pixels (m, 2) from where they are."""
-    ray = rays(s.at_a, focal, radial)
-    seen = np.einsum("mij,mj->mi", R[s.b] @ R[s.a].transpose(0, 2, 1), ray)
+def _residuals(pairs: Ints, at: Floats, R: Floats, focal: float, radial: float) -> tuple[Floats, Floats, Floats]:
+    """Rays in the first image (m, 3), the same seen by the second one, and pixels (m, 2) from where they are.
+
+    pairs: (m, 2) numbers of the two images of each match, the earlier one first. at: (m, 2, 2) its places in both,
+    pixels from the middle of the image.
+    """
+    ray = rays(at[:, 0], focal, radial)
+    seen = np.einsum("mij,mj->mi", R[pairs[:, 1]] @ R[pairs[:, 0]].transpose(0, 2, 1), ray)
     flat = seen[:, :2] / np.maximum(seen[:, 2:], 1e-3)
-    return ray, seen, focal * flat * (1 + radial * np.square(flat).sum(axis=1, keepdims=True)) - s.at_b
+    return ray, seen, focal * flat * (1 + radial * np.square(flat).sum(axis=1, keepdims=True)) - at[:, 1]
 
 
-def _chained(s: _Sample, count: int, focal: float, sigma: float) -> Floats:
-    """(n, 3, 3) rotations, each from one of the 3 images before: that with the least sum of distances (Kabsch 1976,
-    reweighted)."""
+def _chained(pairs: Ints, at: Floats, count: int, focal: float, sigma: float) -> Floats:
+    """(n, 3, 3) rotations, each from one of the 3 before, of least sum of distances (Kabsch 1976, reweighted)."""
     rotations = np.tile(np.eye(3), (count, 1, 1))
     for image in range(1, count):
         rotations[image] = rotations[image - 1]
         for before in range(image - 1, max(-1, image - 4), -1):
-            both = np.flatnonzero((s.a == before) & (s.b == image))
+            both = np.flatnonzero((pairs == [before, image]).all(axis=1))
             if len(both) < 8:
                 continue
-            one, other = (rays(each[both], focal, 0.0) for each in (s.at_a, s.at_b))
+            one, other = (rays(at[both, end], focal, 0.0) for end in (0, 1))
             one, other = (each / np.linalg.norm(each, axis=1, keepdims=True) for each in (one, other))
             turn, weight = np.eye(3), np.ones(len(both))
             for _ in range(12):
@@ -102,15 +97,15 @@ def _chained(s: _Sample, count: int, focal: float, sigma: float) -> Floats:
     return rotations
 
 
-def _refined(s: _Sample, R: Floats, focal: float, sigma: float) -> tuple[Floats, float, float, Floats]:
+def _refined(pairs: Ints, at: Floats, R: Floats, focal: float, sigma: float) -> tuple[Floats, float, float, Floats]:
     """Levenberg-Marquardt with the loss e / (1 + e), e = (residual / sigma)^2. Returns rotations, focal length, radial
     coefficient and the residuals (m,) in pixels."""
     from scipy.sparse import csr_array  # slow to import
     from scipy.spatial.transform import Rotation
 
     n, radial, damping = len(R), 0.0, 1e-3
-    ray, seen, r = _residuals(s, R, focal, radial)
-    turns = 3 * np.stack([s.a, s.b], axis=1)[:, :, None] + np.arange(3)
+    ray, seen, r = _residuals(pairs, at, R, focal, radial)
+    turns = 3 * pairs[:, :, None] + np.arange(3)
     columns = np.column_stack([turns.reshape(-1, 6), np.tile([3 * n, 3 * n + 1], (len(r), 1))]).repeat(2, axis=0)
 
     def cost(r: Floats) -> float:
@@ -124,9 +119,9 @@ def _refined(s: _Sample, R: Floats, focal: float, sigma: float) -> tuple[Floats,
         by_point = np.zeros((len(r), 2, 3))
         by_point[:, 0, 0] = by_point[:, 1, 1] = focal * inverse
         by_point[:, :, 2] = -focal * seen[:, :2] * inverse[:, None] ** 2
-        by_focal = (_residuals(s, R, focal * 1.0001, radial)[2] - r) / 1e-4  # of its logarithm
-        by_radial = (_residuals(s, R, focal, radial + 1e-4)[2] - r) / 1e-4
-        by_a = np.cross(by_point @ (R[s.b] @ R[s.a].transpose(0, 2, 1)), ray[:, None])
+        by_focal = (_residuals(pairs, at, R, focal * 1.0001, radial)[2] - r) / 1e-4  # of its logarithm
+        by_radial = (_residuals(pairs, at, R, focal, radial + 1e-4)[2] - r) / 1e-4
+        by_a = np.cross(by_point @ (R[pairs[:, 1]] @ R[pairs[:, 0]].transpose(0, 2, 1)), ray[:, None])
         by_b = np.cross(seen[:, None], by_point)
         rows = np.concatenate([by_a, by_b, by_focal[:, :, None], by_radial[:, :, None]], axis=2) * weight[:, None, None]
         J = csr_array((rows.ravel(), columns.ravel(), np.arange(0, rows.size + 1, 8)), shape=(2 * len(r), 3 * n + 2))
@@ -140,7 +135,7 @@ def _refined(s: _Sample, R: Floats, focal: float, sigma: float) -> tuple[Floats,
             step = -np.linalg.solve(H + damping * np.diag(np.diag(H)), gradient)
             tried = Rotation.from_rotvec(step[:-2].reshape(n, 3)).as_matrix() @ R
             lens = focal * float(np.exp(np.clip(step[-2], -0.3, 0.3))), radial + float(step[-1])
-            result = _residuals(s, tried, *lens)
+            result = _residuals(pairs, at, tried, *lens)
             gain = now - cost(result[2])
             if gain > 0:
                 break

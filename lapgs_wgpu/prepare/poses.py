@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lapgs_wgpu.data.images import Size
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.masks import Mask
-from lapgs_wgpu.errors import optional_module
+from lapgs_wgpu.errors import InputError, optional_module
 from lapgs_wgpu.progress import counted
 
 FEATURE_SIDE = 1600  # longer side, pixels: larger images are shrunk to find features
@@ -23,6 +23,10 @@ Ints = NDArray[np.integer]
 Floats = NDArray[np.float64]
 Plane = NDArray[np.float32]
 Match = Mapping[Pair, Ints]  # of pairs of images: (m, 2) numbers of their features
+
+
+class RefusedError(InputError):
+    """Too few cameras could be placed. What was found stays."""
 
 
 class Reconstruction:
@@ -45,8 +49,7 @@ class Reconstruction:
         options.camera_model = model
         colmap.import_images(self._database, images, colmap.CameraMode.__members__[lenses], self.names, options)
         with self.database() as database:
-            self.ids = {image.name: image.image_id for image in database.read_all_images()}
-            self.cameras = {image.name: image.camera_id for image in database.read_all_images()}
+            self._images = {image.name: image for image in database.read_all_images()}
             camera = database.read_all_cameras()[0]
         self.size: Size = (camera.width, camera.height)
         self.prior, self.exif = float(camera.mean_focal_length()), bool(camera.has_prior_focal_length)
@@ -56,7 +59,7 @@ class Reconstruction:
         return self._colmap.Database.open(self._database)
 
     def match(self, pairs: Sequence[Pair], shown: Mapping[str, Sequence[str]] | None = None) -> None:
-        """Find the features of all images, match those of pairs, keep places and matches, and verify these.
+        """Find the features of all images, match those of pairs, and keep places and matches.
 
         shown: names of further images, below the same folder, for cameras that stand still: an image has the features
         of all of its own, as many for each and in the order of time, and those of one time are matched. So what moves
@@ -68,14 +71,13 @@ class Reconstruction:
                 features = [sift(self.images / each) for each in (shown[name] if shown else [name])]
                 self.places[name] = np.concatenate([places for places, _ in features])
                 descriptors[name] = [looks for _, looks in features]
-                database.write_keypoints(self.ids[name], self.places[name])
+                database.write_keypoints(self._images[name].image_id, self.places[name])
         for pair in counted(pairs, len(pairs), "pairs of images matched"):
             found, before = [], np.zeros(2, np.int64)
             for one, other in zip(*(descriptors[name] for name in pair), strict=True):
                 found.append(nearest(one, other) + before)
                 before += [len(one), len(other)]
             self.matches[pair] = np.concatenate(found)
-        self.verify()
 
     def verify(self, masks: Mapping[str, Mask] | None = None) -> None:
         """Find epipolar geometries that explain many of the matches, of those outside masks alone."""
@@ -87,8 +89,8 @@ class Reconstruction:
             for camera in database.read_all_cameras():
                 camera.has_prior_focal_length = self.exif  # the length of an earlier attempt would mislead
                 database.update_camera(camera)
-            for (one, other), each in matches.items():
-                database.write_matches(self.ids[one], self.ids[other], each.astype(np.uint32))
+            for pair, each in matches.items():
+                database.write_matches(*(self._images[name].image_id for name in pair), each.astype(np.uint32))
         options = colmap.TwoViewGeometryOptions()
         options.ransac.random_seed, options.ransac.max_num_trials = SEED, 1000
         options.detect_watermark = False  # what follows the camera is no watermark
@@ -96,11 +98,11 @@ class Reconstruction:
 
     def verified(self) -> dict[Pair, Ints]:
         """The matches that an epipolar geometry explains, of pairs that share 15 or more."""
-        names, verified = {number: name for name, number in self.ids.items()}, {}
+        names, verified = {image.image_id: name for name, image in self._images.items()}, {}
         with self.database() as database:
             for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
-                one, other = self._colmap.pair_id_to_image_pair(pair)
                 if len(geometry.inlier_matches) >= 15:
+                    one, other = self._colmap.pair_id_to_image_pair(pair)
                     verified[names[one], names[other]] = geometry.inlier_matches.astype(np.int64)
         return verified
 
@@ -155,14 +157,13 @@ class Reconstruction:
         """A pycolmap.Reconstruction without points. cameras: of images, lenses at their size and poses (3 or 4, 4),
         world to camera."""
         colmap, model = self._colmap, self._colmap.Reconstruction()
-        for number, lens in {self.cameras[name]: lens for name, (lens, _) in cameras.items()}.items():
+        for number, lens in {self._images[name].camera_id: lens for name, (lens, _) in cameras.items()}.items():
             values = [lens.fx, lens.fy, lens.cx, lens.cy, *lens.radial[:2], *lens.tangential]
             model.add_camera_with_trivial_rig(
                 colmap.Camera(model="OPENCV", width=lens.width, height=lens.height, params=values, camera_id=number)
             )
         for name, (_, pose) in cameras.items():
-            image = colmap.Image(name=name, camera_id=self.cameras[name], image_id=self.ids[name])
-            model.add_image_with_trivial_frame(image, colmap.Rigid3d(pose[:3]))
+            model.add_image_with_trivial_frame(self._images[name], colmap.Rigid3d(pose[:3]))
         return model
 
 

@@ -15,9 +15,9 @@ from lapgs_wgpu.data.masks import Mask
 from lapgs_wgpu.data.readers.colmap import IMAGES
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.atomic import atomic_write
-from lapgs_wgpu.prepare.capture_folder import REPORT
 from lapgs_wgpu.prepare.diagnosis import Diagnosis, diagnose
 
+REPORT = "report.html"
 IMAGES_SHOWN, WIDTH = 24, 220  # evenly chosen from those that were looked at; pixels of each
 POINTS_DRAWN, DRAWING = 1200, 420  # of the cloud; pixels of the drawing
 RED, STRENGTH = np.array([235.0, 60.0, 40.0]), 0.45  # over what moves

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,14 +11,16 @@ from lapgs_wgpu.data.images import decode
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.masks import Mask
 from lapgs_wgpu.prepare.pan import Pan, rays, solve_pan
-from lapgs_wgpu.prepare.path import path_faults
-from lapgs_wgpu.prepare.poses import Reconstruction, import_pycolmap, without
+from lapgs_wgpu.prepare.poses import Floats, Reconstruction, import_pycolmap, without
 from lapgs_wgpu.progress import say
 
 FOCALS = 1.0, 1.4, 0.7  # times the width, where EXIF says nothing
 PURE, NEARLY = 0.8, 0.6  # share of the verified matches that turning alone explains: a pan; one, if nothing else fits
 GOOD, SHARP = 0.95, 1.5e-3  # the search ends: share of the images, and the mean error in parts of the longer side
 SECONDS, SECONDS_EACH, CORES = 20.0, 0.6, 2  # of the search: for any film, and for each image, on so many cores
+STEP, TURN = 8.0, 8.0  # of a path that a hand can walk: largest step and turn over their medians
+AROUND = 75.0  # degrees a second, around the middle of the scene, at most
+FEWEST = 8  # images whose path is judged
 
 
 class Found(NamedTuple):
@@ -74,11 +77,11 @@ def search(source: Reconstruction, *, rival: bool = False) -> Found | None:
 
 
 def _solved(source: Reconstruction, focal: float, together: bool, held: bool, seconds: float) -> Found | None:
-    found = described(source, source.solve(focal, together=together, held=held, seconds=seconds))
-    return None if found is None else found._replace(together=together, held=held)
+    model = source.solve(focal, together=together, held=held, seconds=seconds)
+    return described(source, model, together=together, held=held)
 
 
-def described(source: Reconstruction, model: Any) -> Found | None:
+def described(source: Reconstruction, model: Any, *, together: bool = False, held: bool = False) -> Found | None:
     """A reconstruction, and what tells how good it is. None where it has no points."""
     if model is None or model.num_reg_images() < 2 or not model.num_points3D():
         return None
@@ -91,7 +94,7 @@ def described(source: Reconstruction, model: Any) -> Found | None:
     bent = camera.model.name == "RADIAL" and abs(camera.params[3]) > 0.4  # as no camera's lens is
     faults = len(path_faults(places, axes, points, placed)) + bent
     error = float(model.compute_mean_reprojection_error())
-    return Found(model, placed, faults, error, camera.mean_focal_length())
+    return Found(model, placed, faults, error, camera.mean_focal_length(), together=together, held=held)
 
 
 def panned(source: Reconstruction, pan: Pan) -> Found:
@@ -125,3 +128,37 @@ def longest_part(names: Sequence[str], placed: Sequence[str]) -> list[str]:
     """The longest run of placed images, in which at most 2 images in a row are missing."""
     steps = np.diff([names.index(name) for name in placed])
     return max(np.split(np.array(placed), np.flatnonzero(steps > 3) + 1), key=len).tolist()
+
+
+def path_faults(places: Floats, axes: Floats, points: Floats, names: Sequence[str]) -> list[tuple[str, int]]:
+    """The faults of a path, with the number of the image at which each is.
+
+    places, axes: (n, 3) of the cameras and where they look, in the order of time. points: (N, 3) of the scene. names:
+    of the images, which are milliseconds in films. Steps that are small beside the scene's distance are noise, of a
+    camera that turns or stands.
+    """
+    if len(places) < FEWEST:
+        return []
+    steps = np.diff(places, axis=0)
+    length = np.linalg.norm(steps, axis=1)
+    away = float(np.median(np.linalg.norm(points - np.median(places, axis=0), axis=1)))
+    usual = max(float(np.median(length)), 1e-3 * away)
+    turns = np.degrees(np.arccos(np.clip((axes[1:] * axes[:-1]).sum(axis=1), -1, 1)))
+    turn = max(float(np.median(turns)), 0.5)
+    cosine = (steps[1:] * steps[:-1]).sum(axis=1) / np.maximum(length[1:] * length[:-1], 1e-12)
+    back = (cosine < -0.5) & (np.minimum(length[1:], length[:-1]) > max(usual, 1e-2 * away))
+    still = length < (0.02 * usual if np.median(length) == usual else 0.0)
+    long = max(3, len(still) // 10)
+    stalls = [i for i in range(len(still) - long + 1) if still[i : i + long].all()][:1]
+    leaps, jerks = np.flatnonzero(length > STEP * usual).tolist(), np.flatnonzero(turns > TURN * turn).tolist()
+    faults = [(f"a step of {length[i] / usual:.0f} times the usual one", i + 1) for i in leaps]
+    faults += [(f"a turn of {turns[i]:.0f} degrees", i + 1) for i in jerks]
+    faults += [("the path doubles back", i + 1) for i in np.flatnonzero(back).tolist()]
+    faults += [("the path stalls", i) for i in stalls]
+    stems = [Path(name).stem for name in names]
+    if all(len(stem) == 8 and stem.isdecimal() for stem in stems):
+        seconds = (int(stems[-1]) - int(stems[0])) / 1000
+        around = (places[[0, -1]] - np.median(points, axis=0)) / away
+        speed = np.degrees(2 * np.arcsin(min(float(np.linalg.norm(around[1] - around[0])) / 2, 1.0))) / seconds
+        faults += [(f"{speed:.0f} degrees a second around the scene", 0)] * bool(speed > AROUND)
+    return faults
