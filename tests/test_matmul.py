@@ -8,10 +8,10 @@ from helpers.scenes import relative
 from torch import Tensor
 
 from lapgs_wgpu.gpu import matmul
+from lapgs_wgpu.gpu.array import BufferPool
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.gpu.matmul import Matmul, Matrix
-from lapgs_wgpu.gpu.pool import BufferPool
 
 pytestmark = pytest.mark.kernels
 

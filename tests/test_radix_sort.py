@@ -5,10 +5,9 @@ import pytest
 from numpy.typing import NDArray
 
 from lapgs_wgpu.gpu import radix_sort
-from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
-from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.gpu.radix_sort import RadixSort
 
 pytestmark = pytest.mark.kernels

@@ -10,11 +10,10 @@ from helpers.matrices import on_device, random, read
 from helpers.scenes import relative
 from torch import Tensor, nn
 
-from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.matmul import sum_columns
-from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.dynamics import dynamics_loss
 from lapgs_wgpu.motion.fields.laplacian import VARIANCE_FLOOR, VARIANCE_SPREAD, LaplacianMotion

@@ -6,8 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lapgs_wgpu.gpu.array import DeviceArray
-from lapgs_wgpu.gpu.pool import BufferPool
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.motion.playback.playback import Playback
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterizer import Rasterizer

@@ -2,10 +2,9 @@
 
 from dataclasses import dataclass, replace
 
-from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.gpu.pool import BufferPool
 
 _TILE = 64  # matmul.wgsl
 _SPLIT = 1 << 11  # inner elements of a partial sum where the inner dimension is split

@@ -2,10 +2,9 @@
 
 import struct
 
-from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.gpu.scan import Scan
 
 _SORT_BLOCK_ITEMS = 2048  # common/sort.wgsl: 128 lanes x 16 elements

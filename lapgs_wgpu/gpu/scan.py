@@ -1,9 +1,8 @@
 """Exclusive scan on the device. The number of elements is read on the device."""
 
-from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.gpu.pool import BufferPool
 
 _BLOCK_ITEMS = 2048  # common/block.wgsl
 

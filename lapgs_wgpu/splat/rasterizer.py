@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import DeviceMemoryError
-from lapgs_wgpu.gpu.array import DeviceArray, read_all
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray, read_all
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.gpu.radix_sort import RadixSort
 from lapgs_wgpu.gpu.scan import Scan
 from lapgs_wgpu.splat.buffer_plan import BufferPlan, BufferPlans, roomy

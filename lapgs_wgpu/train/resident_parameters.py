@@ -13,9 +13,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lapgs_wgpu.gpu.array import DeviceArray, read_all
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray, read_all
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.laplacian import VARIANCE_FLOOR, VARIANCE_SPREAD
 from lapgs_wgpu.motion.passes.activation_passes import GEOMETRY_FLOATS, SH_FLOATS
 from lapgs_wgpu.motion.passes.grid_field_passes import FieldArrays, GridFieldPasses

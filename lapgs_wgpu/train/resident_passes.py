@@ -5,10 +5,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from lapgs_wgpu.data.views import View
-from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.gpu.kernel import Commands, Kernel, Later, Recording
 from lapgs_wgpu.gpu.matmul import sum_columns
-from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.passes.activation_passes import ActivationPasses, Line
 from lapgs_wgpu.motion.passes.grid_field_passes import Decoding, GridFieldPasses

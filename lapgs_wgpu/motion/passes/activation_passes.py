@@ -2,10 +2,9 @@
 
 from typing import NamedTuple
 
-from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.config import GEOMETRY, FieldConfig
 from lapgs_wgpu.motion.passes.grid_field_passes import Decoding
 from lapgs_wgpu.motion.passes.samples import SamplePasses

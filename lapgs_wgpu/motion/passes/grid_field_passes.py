@@ -12,11 +12,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.matmul import Matmul, Matrix
-from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.config import APPEARANCE_SCALE, GEOMETRY, FieldConfig, static_grid, temporal_grids
 from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
 from lapgs_wgpu.motion.passes.hash_encoder_passes import HashEncoderPasses, PointSet

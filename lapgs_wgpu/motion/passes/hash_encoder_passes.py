@@ -11,10 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.gpu.device import SOFTWARE_LOOP_TURNS, Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.hash_grid_config import GridShape
 
 _ALIGNED = 64  # rows; a multiple of 256 bytes for every row size, at which a binding may begin

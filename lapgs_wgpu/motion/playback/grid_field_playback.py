@@ -10,10 +10,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.config import GEOMETRY, FieldConfig, static_grid, temporal_grids
 from lapgs_wgpu.motion.passes.hash_encoder_passes import HashEncoderPasses, PointSet
 from lapgs_wgpu.splat.gaussians import Gaussians

@@ -8,9 +8,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.gpu.array import DeviceArray, read_all
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray, read_all
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.io.ply import GaussianSnapshot
 from lapgs_wgpu.motion.fields.config import MIN_SCALE
 from lapgs_wgpu.motion.playback.grid_field_playback import GridFieldPlayback

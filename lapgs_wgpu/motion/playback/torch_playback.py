@@ -3,8 +3,7 @@
 import torch
 from torch import Tensor
 
-from lapgs_wgpu.gpu.array import DeviceArray
-from lapgs_wgpu.gpu.pool import BufferPool
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.io.ply import GaussianSnapshot
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.gaussians import Gaussians
