@@ -15,8 +15,8 @@ from lapgs_wgpu.errors import DeviceMemoryError
 from lapgs_wgpu.gpu.array import BufferPool, DeviceArray, read_all
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.gpu.radix_sort import RadixSort
-from lapgs_wgpu.gpu.scan import Scan
+from lapgs_wgpu.gpu.radix_sort import radix_sort
+from lapgs_wgpu.gpu.scan import scan
 from lapgs_wgpu.splat.buffer_plan import BufferPlan, BufferPlans, roomy
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.constants import SPLAT_FLOATS
@@ -45,10 +45,6 @@ class Rasterizer:
         self.pool = BufferPool(device)
         self.plans = BufferPlans(capacity)
         self.max_capacity = device.max_binding // (4 * _RECORD_FLOATS)
-        self._flags_scan = Scan(device, self.pool, "visible", "flags")
-        self._offset_scan = Scan(device, self.pool, "offsets", "gather")
-        self._depth_sort = RadixSort(device, self.pool, "depth sort", lane_runs=self.config.lane_runs)
-        self._tile_sort = RadixSort(device, self.pool, "tile sort", lane_runs=self.config.lane_runs)
         self._drawings = 0
         self._trusted: set[tuple[str, bool, bool]] = set()  # passes whose subgroups were checked
 
@@ -170,15 +166,24 @@ class Rasterizer:
             commands.clear(needed)
         commands.run(Kernel.get(device, "project", **config.tile_defines), _groups(n), arrays)
         self._color(commands, "color", drawing, arrays, colors=gaussians.sh)
-        self._flags_scan(commands, length=length, capacity=n, values=tile_counts, prefix=offsets, total=visible)
+        scan(commands, pool, "visible", length=length, values=tile_counts, prefix=offsets, total=visible, flags=True)
         commands.run(Kernel.get(device, "compact"), _groups(n), arrays)
-        _, arrays["ids"] = self._depth_sort(commands, length=visible, capacity=n, bits=32, keys=keys, payload=ids)
-        scanned = {"values": tile_counts, "indices": arrays["ids"], "prefix": offsets, "total": needed}
-        self._offset_scan(commands, length=visible, capacity=n, **scanned)
+        _, ids = radix_sort(
+            commands, pool, "depth sort", length=visible, keys=keys, payload=ids, bits=32, lane_runs=config.lane_runs
+        )
+        arrays["ids"] = ids
+        scan(commands, pool, "offsets", length=visible, values=tile_counts, prefix=offsets, total=needed, indices=ids)
         commands.run(Kernel.get(device, "duplicate_with_keys", **config.tile_defines), _groups(n), arrays)
         bits = max(1, tiles.bit_length())  # one key more than there are tiles, for pads
-        arrays["tile_keys"], arrays["slots"] = self._tile_sort(
-            commands, length=needed, capacity=capacity, bits=bits, keys=tile_keys, payload=None
+        arrays["tile_keys"], arrays["slots"] = radix_sort(
+            commands,
+            pool,
+            "tile sort",
+            length=needed,
+            keys=tile_keys,
+            payload=None,
+            bits=bits,
+            lane_runs=config.lane_runs,
         )
         commands.clear(ranges)
         commands.run(Kernel.get(device, "tile_ranges"), _groups(-(-capacity // 4)), arrays)
