@@ -39,15 +39,9 @@ def sort(
         if words is not None:
             held[name] = DeviceArray.upload(device, name, words)
     with Commands(device) as commands:
+        given = held["length"], held["keys"], held.get("payload")
         sorted_keys, carried = radix_sort.radix_sort(
-            commands,
-            pool or BufferPool(device),
-            "test",
-            length=held["length"],
-            keys=held["keys"],
-            payload=held.get("payload"),
-            bits=bits,
-            lane_runs=lane_runs,
+            commands, pool or BufferPool(device), "test", *given, bits=bits, lane_runs=lane_runs
         )
     count = min(length, len(keys))
     return sorted_keys.read()[:count], carried.read()[:count]

@@ -20,10 +20,10 @@ def radix_sort(
     commands: Commands,
     pool: BufferPool,
     name: str,
-    *,
     length: DeviceArray,
     keys: DeviceArray,
     payload: DeviceArray | None,
+    *,
     bits: int,
     lane_runs: bool,
 ) -> tuple[DeviceArray, DeviceArray]:

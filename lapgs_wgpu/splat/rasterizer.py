@@ -168,22 +168,13 @@ class Rasterizer:
         self._color(commands, "color", drawing, arrays, colors=gaussians.sh)
         scan(commands, pool, "visible", length=length, values=tile_counts, prefix=offsets, total=visible, flags=True)
         commands.run(Kernel.get(device, "compact"), _groups(n), arrays)
-        _, ids = radix_sort(
-            commands, pool, "depth sort", length=visible, keys=keys, payload=ids, bits=32, lane_runs=config.lane_runs
-        )
+        _, ids = radix_sort(commands, pool, "depth sort", visible, keys, ids, bits=32, lane_runs=config.lane_runs)
         arrays["ids"] = ids
         scan(commands, pool, "offsets", length=visible, values=tile_counts, prefix=offsets, total=needed, indices=ids)
         commands.run(Kernel.get(device, "duplicate_with_keys", **config.tile_defines), _groups(n), arrays)
         bits = max(1, tiles.bit_length())  # one key more than there are tiles, for pads
         arrays["tile_keys"], arrays["slots"] = radix_sort(
-            commands,
-            pool,
-            "tile sort",
-            length=needed,
-            keys=tile_keys,
-            payload=None,
-            bits=bits,
-            lane_runs=config.lane_runs,
+            commands, pool, "tile sort", needed, tile_keys, None, bits=bits, lane_runs=config.lane_runs
         )
         commands.clear(ranges)
         commands.run(Kernel.get(device, "tile_ranges"), _groups(-(-capacity // 4)), arrays)

@@ -15,7 +15,7 @@ from typing import NamedTuple
 from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.gpu.matmul import Matmul, Matrix
+from lapgs_wgpu.gpu.matmul import Matrix, multiply, multiply_long
 from lapgs_wgpu.motion.fields.config import APPEARANCE_SCALE, GEOMETRY, FieldConfig, static_grid, temporal_grids
 from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
 from lapgs_wgpu.motion.passes.hash_encoder_passes import HashEncoderPasses, PointSet
@@ -78,7 +78,6 @@ class GridFieldPasses:
         self._encoders = [HashEncoderPasses(device, [static_grid(config)], config.bound)]
         if temporal := temporal_grids(config):
             self._encoders.append(HashEncoderPasses(device, temporal, config.bound, first_table=1))
-        self._product = Matmul(device, self._pool)
         self.dynamics, self._outputs = config.dynamics_size, sum(GEOMETRY) + config.appearance_size
         self._motion, width = config.kind == "laplacian", config.width
         # Channels of all layers: spatial, the motion's inner ones, temporal. The heads read as many as there are placed
@@ -128,7 +127,7 @@ class GridFieldPasses:
         outputs = self._pool.array(f"outputs {number}", (points.count, self._outputs))
         for first, count in self._blocks(points):
             _, features = self._activate(commands, first, count, inputs, arrays.weights)
-            self._product(commands, features, Matrix.of(heads).transpose, Matrix.of(outputs.rows(first, count)))
+            multiply(commands, self._pool, features, Matrix.of(heads).transpose, Matrix.of(outputs.rows(first, count)))
         return Decoding(t, sampling, points, inputs, heads, biases, outputs)
 
     def decode_bwd(self, commands: Commands, decoding: Decoding, arrays: FieldArrays, gradients: FieldArrays) -> None:
@@ -139,7 +138,7 @@ class GridFieldPasses:
         d_beside = gradients.beside
         if decoding.sampling is not None:
             d_beside = self._pool.array("d_beside", decoding.inputs["beside"].shape)
-        inputs, d_inputs, split = decoding.inputs, decoding.inputs | {"beside": d_beside}, self._product.split_k
+        inputs, d_inputs = decoding.inputs, decoding.inputs | {"beside": d_beside}
         weights, d_weights, number = arrays.weights, gradients.weights, decoding.points.number
         d_heads = self._pool.array("d_heads", decoding.heads.shape)
         d_biases = self._pool.array("d_biases", (_BIASES,))
@@ -148,16 +147,16 @@ class GridFieldPasses:
             layers, features = self._activate(commands, first, count, inputs, weights)
             d, more = Matrix.of(decoding.outputs.rows(first, count)), first > 0
             ones = Matrix.of(inputs["beside"].rows(first, count)).from_column(self.dynamics, 1)
-            split(commands, d.transpose, features, Matrix.of(d_heads), add=more)
-            split(commands, d.transpose, ones, Matrix(d_biases, self._outputs, 1, 1), add=more)
-            self._product(commands, d, Matrix.of(decoding.heads), features)
+            multiply_long(commands, self._pool, d.transpose, features, Matrix.of(d_heads), add=more)
+            multiply_long(commands, self._pool, d.transpose, ones, Matrix(d_biases, self._outputs, 1, 1), add=more)
+            multiply(commands, self._pool, d, Matrix.of(decoding.heads), features)
             self._gate("gate_bwd", commands, count, weights, d_features=features.array, layers=layers.array)
-            split(commands, layers.transpose, ones, of_layers, add=True)
+            multiply_long(commands, self._pool, layers.transpose, ones, of_layers, add=True)
             for name, channel, place in self._products:
                 own, matrix = layers.from_column(channel, place[0]), Matrix(weights, *place)
                 given, d_given = (_columns(each[name], first, count, matrix) for each in (inputs, d_inputs))
-                split(commands, own.transpose, given, Matrix(d_weights, *place), add=True)
-                self._product(commands, own, matrix, d_given)
+                multiply_long(commands, self._pool, own.transpose, given, Matrix(d_weights, *place), add=True)
+                multiply(commands, self._pool, own, matrix, d_given)
         bound = self._bound(weights, decoding.time, number) | {"d_weights": d_weights}
         bound |= {"d_series": self._pool.array("d_series", (self.config.width,))}
         bound |= {"d_heads": d_heads, "d_biases": d_biases}
@@ -247,7 +246,7 @@ class GridFieldPasses:
         for name, channel, place in self._products:
             own, matrix = layers.from_column(channel, place[0]), Matrix(weights, *place)
             given, more = _columns(inputs[name], first, count, matrix), name == "temporal" and self.dynamics > 0
-            self._product(commands, given, matrix.transpose, own, add=more)
+            multiply(commands, self._pool, given, matrix.transpose, own, add=more)
         self._gate("gate", commands, count, weights, layers=layers.array, features=features.array)
         return layers, features
 
