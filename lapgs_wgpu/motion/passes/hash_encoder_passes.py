@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.gpu.device import SOFTWARE_LOOP_TURNS, Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.motion.fields.hash_grid_config import GridShape
+from lapgs_wgpu.motion.fields.config import GridShape
 
 _ALIGNED = 64  # rows; a multiple of 256 bytes for every row size, at which a binding may begin
 _LEVEL_WORDS = 16  # common/hashgrid.wgsl: struct Level
