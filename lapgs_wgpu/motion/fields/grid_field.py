@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.fields.config import GEOMETRY, TEMPORAL_AXES, FieldConfig
+from lapgs_wgpu.motion.fields.config import GEOMETRY, FieldConfig, temporal_grids
 from lapgs_wgpu.motion.fields.deformation import Deformation, Field, Nearby, TimeSamples, linear
 from lapgs_wgpu.motion.fields.hash_encoder import HashEncoder, HashGrid
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion, TimeMotion
@@ -31,10 +31,9 @@ class GridField(Field):
             return linear(shapes[f"{name}.weight"], generator)
 
         self.static_grid = HashGrid(config.static, (0, 1, 2), generator)
-        axes = TEMPORAL_AXES if config.temporal_hash else ()
+        axes = [grid.axes for grid in temporal_grids(config)]
         self.temporal_grids = nn.ModuleList(HashGrid(config.temporal, three, generator) for three in axes)
-        groups = [[self.static_grid], self.grids[1:]] if axes else [[self.static_grid]]
-        self._encoder = HashEncoder(device, groups, config.bound)
+        self._encoder = HashEncoder(device, [[self.static_grid], self.grids[1:]], config.bound)
         self.spatial = layer("spatial")
         self.temporal = layer("temporal")
         hidden = [(layer(f"hidden.{2 * i}"), nn.ReLU()) for i in range(config.depth)]
@@ -84,11 +83,10 @@ class GridField(Field):
         d_dc, d_opacity = look[:, :3] if size else None, look[:, 3] if size == 4 else None
         return Deformation(rotation, shift, d_quats, d_scales, d_dc, d_opacity)
 
-    def _decode(self, t: float, dynamics: Tensor | None, static: Tensor, temporal: Tensor | None = None) -> Tensor:
+    def _decode(self, t: float, dynamics: Tensor | None, static: Tensor, temporal: Tensor) -> Tensor:
         """Return the outputs of the geometry heads (N, 14) and, in further columns, of the appearance head."""
-        count, size = len(static), self.config.dynamics_size
-        temporal = static.new_zeros(count, 0) if temporal is None else temporal
-        dynamics = dynamics if size and dynamics is not None else static.new_zeros(count, size)
+        size = self.config.dynamics_size
+        dynamics = dynamics if size and dynamics is not None else static.new_zeros(len(static), size)
         outputs = decode(static, temporal, dynamics, self._weights(t))
         if not len(self.hidden):
             return outputs
@@ -142,5 +140,5 @@ class GridField(Field):
 def _smoothness(here: list[Tensor], near: list[Tensor], nearby: Nearby) -> Tensor:
     """Grid4D's smoothness loss: the mean squared distance between the features of near places, static and temporal."""
     sq_distances = torch.stack([(b - a[nearby.rows]).square().sum() for a, b in zip(here, near, strict=True)])
-    weights = sq_distances.new_tensor([nearby.static_weight, nearby.temporal_weight][: len(sq_distances)])
+    weights = sq_distances.new_tensor([nearby.static_weight, nearby.temporal_weight])
     return (weights * sq_distances).sum() / max(1, len(nearby.rows))

@@ -50,8 +50,8 @@ class Decoding(NamedTuple):
 
     time: gives that of the field, in [0, 1]. sampling: gives those of the Gaussians; None for all, in their order.
     points: of the encoder. inputs: of the decoder, by name: beside (count, D + 1) dynamics attributes, then ones;
-    static and temporal (count, features), the latter where there is any; in the backward pass these two become their
-    gradients. heads: (outputs, features) weights at that time, of what the gate leaves and of the motion's inner layer.
+    static and temporal (count, features); in the backward pass these two become their gradients. heads: (outputs,
+    features) weights at that time, of what the gate leaves and of the motion's inner layer.
     biases: (20,) of the heads, of which as many count as there are outputs. outputs: (count, outputs) of the heads,
     without their biases; before the backward pass they become their gradient.
     """
@@ -75,9 +75,10 @@ class GridFieldPasses:
     def __init__(self, device: Device, config: FieldConfig) -> None:
         self.config, self._device, self._pool = config, device, BufferPool(device)
         self._samples = SamplePasses(device, self._pool)
-        self._encoders = [HashEncoderPasses(device, [static_grid(config)], config.bound)]
-        if temporal := temporal_grids(config):
-            self._encoders.append(HashEncoderPasses(device, temporal, config.bound, first_table=1))
+        grids = [static_grid(config)], temporal_grids(config)
+        self._encoders = [
+            HashEncoderPasses(device, group, config.bound, first_table=i) for i, group in enumerate(grids)
+        ]
         self.dynamics, self._outputs = config.dynamics_size, sum(GEOMETRY) + config.appearance_size
         self._motion, width = config.kind == "laplacian", config.width
         # Channels of all layers: spatial, the motion's inner ones, temporal. The heads read as many as there are placed
@@ -92,7 +93,7 @@ class GridFieldPasses:
             self.places[name] = self.count
             self.count += math.prod(shapes[name])
         self._block = max(64, min(_BLOCK, device.max_binding // (4 * self._channels) // 64 * 64))
-        static, moving = static_grid(config).features, sum(grid.features for grid in temporal_grids(config))
+        static, moving = (encoder.features for encoder in self._encoders)
         first, row, size = self.places["temporal.weight"], shapes["temporal.weight"][1], self.dynamics
         # What is added to the layers: the first columns of an input, from a channel on, times a matrix of the weights
         # (channels, columns); of it also the stride and the first number.
@@ -116,7 +117,7 @@ class GridFieldPasses:
         if sampling is not None:
             beside = self._pool.array(f"beside {number}", (points.count, beside.shape[1]))
             self._samples.rows(commands, f"set {number}", sampling, arrays.beside, beside, back=False)
-        inputs = dict(zip(("beside", "static", "temporal"), [beside, *encodings], strict=False))
+        inputs = dict(zip(("beside", "static", "temporal"), [beside, *encodings], strict=True))
         heads = self._pool.array(f"heads {number}", (self._outputs, self._placed))
         biases = self._pool.array(f"biases {number}", (_BIASES,))
         bound = self._bound(arrays.weights, t, number) | {"heads": heads, "biases": biases}
@@ -187,7 +188,7 @@ class GridFieldPasses:
         here, there = (self._encode(commands, points, arrays.tables) for points in (means, places))
         forth, back = Kernel.get(self._device, "smoothness"), Kernel.get(self._device, "smoothness_bwd")
         sums = []
-        for group, (a, b, weight) in enumerate(zip(here, there, weights, strict=False)):
+        for group, (a, b, weight) in enumerate(zip(here, there, weights, strict=True)):
             (count, features), total = a.shape, self._pool.array(f"differences {group}", (means.count,))
             content = forth.uniform("Smoothness", pairs=count, features=features, scale=2 * weight)
             both = {"smoothness": self._pool.constant(content), "here": a, "there": b}
