@@ -67,7 +67,7 @@ class FrameRenderer:
         gaussians = dataclasses.replace(self.playback.at(request.time), **changes)
         depths = request.mode == "depth"
         drawing = self._rasterizer.draw_whole(gaussians, request.camera, background, depth=depths)
-        splats = int(drawing.lists.visible.read()[0])
+        splats = int(drawing.arrays["visible"].read()[0])
         if depths:
             rest, depth = drawing.image.read()[3:]
             seen = rest < 0.5

@@ -20,7 +20,7 @@ from lapgs_wgpu.gpu.scan import scan
 from lapgs_wgpu.splat.buffer_plan import BufferPlan, BufferPlans, roomy
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.constants import SPLAT_FLOATS
-from lapgs_wgpu.splat.drawing import Drawing, GaussianGradients, TileLists, sh_defines
+from lapgs_wgpu.splat.drawing import Drawing, GaussianGradients, sh_defines
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.raster_config import MAX_BAND_TILES, RasterConfig, raster_config
 
@@ -106,7 +106,7 @@ class Rasterizer:
             move=move,
         )
         for band in range(drawing.plan.bands):
-            drawing.lists = self._draw_band(commands, drawing, band)
+            self._draw_band(commands, drawing, band)
             commands.flush()
         return drawing
 
@@ -147,7 +147,7 @@ class Rasterizer:
         self.plans.now = replace(plan, capacity=min(limit, roomy(most)), bands=bands)
         return True
 
-    def _draw_band(self, commands: Commands, drawing: Drawing, band: int) -> TileLists:
+    def _draw_band(self, commands: Commands, drawing: Drawing, band: int) -> None:
         device, pool, config, gaussians = self.device, self.pool, self.config, drawing.gaussians
         n, capacity, tiles = len(gaussians), drawing.plan.capacity, self._band_tiles(drawing, band)
         frame = pool.varying(f"frame {band}", lambda: self._frame(drawing, band))
@@ -158,7 +158,7 @@ class Rasterizer:
         tile_keys, slot_ids = (pool.array(name, (capacity,), "uint32") for name in ("tile keys", "slot ids"))
         ranges = pool.array("ranges", (tiles + 1, 4), "uint32")
         length = pool.constant(n.to_bytes(4, "little"))
-        arrays = gaussians.arrays() | {"frame": frame, "needed": needed}
+        arrays = drawing.arrays = gaussians.arrays() | {"frame": frame, "needed": needed}
         arrays |= {"splats": drawing.splats, "image": drawing.image}
         arrays |= {"tile_counts": tile_counts, "ids": ids, "keys": keys, "prefix": offsets, "visible": visible}
         arrays |= {"offsets": offsets, "tile_keys": tile_keys, "slot_ids": slot_ids, "ranges": ranges}
@@ -183,7 +183,6 @@ class Rasterizer:
             if config.round_splats:
                 defines |= {"CONTINUED": number > 0, "LAST_ROUND": number == drawing.plan.rounds - 1}
             commands.run(Kernel.get(device, "rasterize", **defines), tiles, arrays)
-        return TileLists(*(arrays[name] for name in TileLists._fields))
 
     def _color(
         self, commands: Commands, name: str, drawing: Drawing, arrays: Mapping[str, DeviceArray], **rows: DeviceArray
@@ -238,7 +237,7 @@ class Rasterizer:
         if not self.config.subgroups or key in self._trusted:
             return False
         self._trusted.add(key)
-        ranges = drawing.lists.ranges
+        ranges = drawing.arrays["ranges"]
         flags = ranges.rows(ranges.shape[0] - 1, 1).read()[0]
         if not flags[3 if name == "rasterize_bwd" else 2]:
             return False
@@ -295,8 +294,8 @@ class Rasterizer:
         self, commands: Commands, drawing: Drawing, band: int, d_image: DeviceArray, d_splats: DeviceArray
     ) -> None:
         if drawing.plan.bands > 1:  # the lists of the other bands are gone
-            drawing.lists = self._draw_band(commands, drawing, band)
-        lists, plan = drawing.lists, drawing.plan
+            self._draw_band(commands, drawing, band)
+        plan = drawing.plan
         records = self.pool.array("records", (plan.capacity, _RECORD_FLOATS))
         tails = (3 if drawing.depth else 2) * plan.capacity
         states = 2 * drawing.camera.width * drawing.camera.height if plan.rounds > 1 else 0
@@ -304,8 +303,7 @@ class Rasterizer:
         defines = self.config.raster_defines(depth=drawing.depth)
         kernel = Kernel.get(self.device, "rasterize_bwd", ROUNDS=plan.rounds > 1, **defines)
         gather = Kernel.get(self.device, "gather_gradients", DEPTH=drawing.depth)
-        arrays = lists._asdict() | {"frame": drawing.frames[band]}
-        arrays |= {"splats": drawing.splats, "image": drawing.image, "d_image": d_image, "d_splats": d_splats}
+        arrays = drawing.arrays | {"d_image": d_image, "d_splats": d_splats}
         arrays |= {"records": records, "record_tails": record_tails}
         arrays["tails"] = self.pool.constant(gather.uniform("Tails", capacity=plan.capacity))
         commands.clear(record_tails.rows(0, plan.capacity))  # no slot has a record yet
