@@ -176,10 +176,10 @@ class ResidentParameters:
     def arrays(self, kind: str) -> FieldArrays:
         """What the field computes with (kind "value"), or its gradients; the Gaussians' own for a scene without one."""
         tables = [block.arrays[kind] for name, block in self.blocks.items() if name.endswith(".table")]
-        geometry = self.blocks["geometry"].arrays[kind]
+        geometry, sh = (self.blocks[name].arrays[kind] for name in ("geometry", "sh"))
         if self._weights is None:
-            return FieldArrays(geometry, geometry, [], geometry)
-        return FieldArrays(geometry, self.blocks["beside"].arrays[kind], tables, self.flat_weights(kind))
+            return FieldArrays(geometry, sh, geometry, [], geometry)
+        return FieldArrays(geometry, sh, self.blocks["beside"].arrays[kind], tables, self.flat_weights(kind))
 
     def flat_weights(self, kind: str) -> DeviceArray:
         """The field's weights as one row of numbers."""

@@ -180,8 +180,8 @@ class ResidentPasses:
         return lambda: getattr(self._task, name)
 
     def _activate(self, commands: Commands, degree: int, decoding: Decoding | None) -> Gaussians[DeviceArray]:
-        geometry, sh = (self.parameters.blocks[name].arrays["value"] for name in ("geometry", "sh"))
-        return self._activation.activate(commands, geometry, sh, degree, decoding, antialiased=self._scene.antialiased)
+        values, antialiased = self.parameters.arrays("value"), self._scene.antialiased
+        return self._activation.activate(commands, values, degree, decoding, antialiased=antialiased)
 
     def _record_bwd(
         self,
@@ -195,10 +195,9 @@ class ResidentPasses:
         passes, field, smooth = self._activation, self._field, self._config.smoothness
         values, gradients = self.parameters.arrays("value"), self.parameters.arrays("gradient")
         if line is not None:
-            accelerations = passes.acceleration(commands, line, values.geometry, drawn, by_drawn, gradients.geometry)
+            accelerations = passes.acceleration(commands, line, values, drawn, by_drawn, gradients)
             self._total(commands, accelerations, "acceleration", line.scale)
-        d_sh = self.parameters.blocks["sh"].arrays["gradient"]
-        passes.activate_bwd(commands, values.geometry, drawn, by_drawn, decoding, gradients.geometry, d_sh)
+        passes.activate_bwd(commands, values, drawn, by_drawn, decoding, gradients)
         if field is None or decoding is None:
             return
         for each in (decoding, *(() if line is None else (line.before, line.after))):

@@ -32,14 +32,15 @@ Time = Callable[[], float]  # gives that of the step that is taken, in [0, 1]
 
 
 class FieldArrays(NamedTuple):
-    """What a field computes with, or the gradients of it.
+    """Gaussians and the field that moves them, or the gradients of both.
 
-    geometry: (N, 12), as common/geometry.wgsl has it; its gradient is not the field's. beside: (N, D + 1) dynamics
-    attributes, then ones. tables: (entries, 2) of each grid, the spatial one first. weights: the parameters of
+    geometry: (N, 12), as common/geometry.wgsl has it; its gradient is not the field's. sh: (N, 48). beside: (N, D + 1)
+    dynamics attributes, then ones. tables: (entries, 2) of each grid, the spatial one first. weights: the parameters of
     `GridFieldPasses.places`.
     """
 
     geometry: DeviceArray
+    sh: DeviceArray
     beside: DeviceArray
     tables: list[DeviceArray]
     weights: DeviceArray
