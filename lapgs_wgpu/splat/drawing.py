@@ -20,8 +20,8 @@ class Drawing:
 
     image: (4, H, W) red, green, blue, transmittance; with `depth` (5, H, W), the last plane is the sum of weight times
     camera depth. splats: (N, SPLAT_FLOATS), see constants. needed: (3,) uint32 per band: number of intersections;
-    unused; whether a list needs more rounds. number: counts the rasterizer's drawings. frames: what each band's passes
-    share. move: given a band's frame, records that of the moved camera, if it moves.
+    unused; whether a list needs more rounds. number: counts the rasterizer's drawings. move: given a band's frame,
+    records that of the moved camera, if it moves.
     arrays: by name what the passes of the band drawn last bind. Among them are the sorted lists of its tiles, uint32:
     tile_counts (N,) tiles of each Gaussian, 0 if it is not visible; visible (1,) number of Gaussians in the lists; ids
     (N,) the first visible[0] of them, by depth; offsets (N,) first slot of each of these; slot_ids (capacity,) the
@@ -40,7 +40,6 @@ class Drawing:
     needed: list[DeviceArray]
     move: Callable[[Commands, DeviceArray, int], DeviceArray] | None = None
     arrays: dict[str, DeviceArray] = field(default_factory=dict)
-    frames: dict[int, DeviceArray] = field(default_factory=dict)
 
 
 def sh_defines(degree: int | None) -> dict[str, int]:
@@ -70,18 +69,8 @@ class GaussianGradients(NamedTuple):
         return [array for array in self[:5] if array is not None]
 
 
-class CameraGradient(NamedTuple):
-    """Gradients with respect to a camera.
-
-    rotation: (3,) by a small rotation of the camera about its own center, a vector along the world's axes, radians.
-    position: (3,) by the center, world units.
-    """
-
-    rotation: NDArray[np.float64]
-    position: NDArray[np.float64]
-
-
-def camera_gradient(sums: NDArray[np.float32]) -> CameraGradient:
-    """Return the gradient by the camera from the content of `GaussianGradients.camera`."""
+def camera_gradient(sums: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the gradient by a camera from the content of `GaussianGradients.camera`: (3,) by a small rotation of the
+    camera about its own center, a vector along the world's axes, radians; (3,) by the center, world units."""
     turn, shift = sums.sum(axis=1, dtype=np.float64)
-    return CameraGradient(-turn[:3], -shift[:3])
+    return -turn[:3], -shift[:3]

@@ -151,7 +151,7 @@ class Rasterizer:
         device, pool, config, gaussians = self.device, self.pool, self.config, drawing.gaussians
         n, capacity, tiles = len(gaussians), drawing.plan.capacity, self._band_tiles(drawing, band)
         frame = pool.varying(f"frame {band}", lambda: self._frame(drawing, band))
-        frame = drawing.frames[band] = drawing.move(commands, frame, band) if drawing.move else frame
+        frame = drawing.move(commands, frame, band) if drawing.move else frame
         names = ("tile counts", "ids", "depth keys", "offsets")
         tile_counts, ids, keys, offsets = (pool.array(name, (n,), "uint32") for name in names)
         needed, visible = drawing.needed[band], pool.array("visible", (1,), "uint32")
@@ -275,7 +275,7 @@ class Rasterizer:
         d_means, d_scales = self.pool.array("d_means", (n, 3)), self.pool.array("d_scales", (n, 3))
         d_quats = self.pool.array("d_quats", (n, 4))
         d_sh = d_camera = None
-        arrays = gaussians.arrays() | {"frame": drawing.frames[0], "d_splats": d_splats}
+        arrays = drawing.arrays | {"d_splats": d_splats}
         arrays |= {"d_means": d_means, "d_quats": d_quats, "d_scales": d_scales}
         commands.run(Kernel.get(self.device, "project_bwd"), _groups(n), arrays)
         if camera:  # a row for each workgroup of camera_bwd, twice; each half begins at a multiple of 256 bytes

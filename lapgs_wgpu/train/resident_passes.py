@@ -252,4 +252,4 @@ class ResidentPasses:
             commands.dispatch(kernel, -(-count // 64), seen=seen, guard=guard, **arrays)
         self.parameters.record_adam(commands, guard, moving=moving)
         geometry = self.parameters.blocks["geometry"].arrays["value"]
-        self.corrections.record_step(commands, guard, drawing.frames[0], geometry)
+        self.corrections.record_step(commands, guard, drawing.arrays["frame"], geometry)
