@@ -31,9 +31,10 @@ class GridField(Field):
             return linear(shapes[f"{name}.weight"], generator)
 
         self.static_grid = HashGrid(config.static, (0, 1, 2), generator)
-        axes = [grid.axes for grid in temporal_grids(config)]
-        self.temporal_grids = nn.ModuleList(HashGrid(config.temporal, three, generator) for three in axes)
-        self._encoder = HashEncoder(device, [[self.static_grid], self.grids[1:]], config.bound)
+        temporal = [HashGrid(config.temporal, grid.axes, generator) for grid in temporal_grids(config)]
+        self.temporal_grids = nn.ModuleList(temporal)
+        self.grids = [self.static_grid, *temporal]
+        self._encoder = HashEncoder(device, [[self.static_grid], temporal], config.bound)
         self.spatial = layer("spatial")
         self.temporal = layer("temporal")
         hidden = [(layer(f"hidden.{2 * i}"), nn.ReLU()) for i in range(config.depth)]
@@ -44,11 +45,6 @@ class GridField(Field):
             kind = LaplacianMotion if config.motion == "laplacian" else TimeMotion
             self.motion = kind(self.static_grid.features, config, generator)
         self.appearance = linear(shapes["appearance.weight"]) if config.appearance_size else None
-
-    @property
-    def grids(self) -> list[HashGrid]:
-        """All hash grids, the spatial one first."""
-        return [self.static_grid, *(grid for grid in self.temporal_grids if isinstance(grid, HashGrid))]
 
     def forward(
         self, means: Tensor, t: float, dynamics: Tensor | None = None, nearby: Nearby | None = None
