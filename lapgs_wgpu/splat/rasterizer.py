@@ -266,10 +266,11 @@ class Rasterizer:
         for band in range(drawing.plan.bands):
             self._backward_band(commands, drawing, band, d_image, d_splats)
             commands.flush()
-        columns = {"d_means": 3, "d_quats": 4, "d_scales": 3}
-        found = {name: self.pool.array(name, (n, count)) for name, count in columns.items()}
+        d_means, d_scales = self.pool.array("d_means", (n, 3)), self.pool.array("d_scales", (n, 3))
+        d_quats = self.pool.array("d_quats", (n, 4))
         d_sh = d_camera = None
-        arrays = drawing.arrays | {"d_splats": d_splats} | found
+        arrays = drawing.arrays | {"d_splats": d_splats}
+        arrays |= {"d_means": d_means, "d_quats": d_quats, "d_scales": d_scales}
         commands.run(Kernel.get(self.device, "project_bwd"), _groups(n), arrays)
         if camera:  # a row for each workgroup of camera_bwd, twice; each half begins at a multiple of 256 bytes
             d_camera = self.pool.array("d_camera", (2, (_groups(n) + 15) // 16 * 16, 4))
@@ -281,7 +282,7 @@ class Rasterizer:
         if d_camera is not None:
             kernel = Kernel.get(self.device, "camera_bwd", FORCE=True)
             commands.run(kernel, _groups(n), arrays | {"d_camera": d_camera.rows(1, 1)})
-        return GaussianGradients(d_splats, *found.values(), d_sh, d_camera)
+        return GaussianGradients(d_splats, d_means, d_quats, d_scales, d_sh, d_camera)
 
     def _backward_band(
         self, commands: Commands, drawing: Drawing, band: int, d_image: DeviceArray, d_splats: DeviceArray
