@@ -236,8 +236,9 @@ class Scene4D:
             background = torch.as_tensor(background, dtype=torch.float32)
         with torch.no_grad():
             now = self.at(t, timing=timing)
+            tensors = (now.means, now.quats, now.scales, now.opacities, now.sh)
             return rasterize(
-                *now.arrays().values(),
+                *tensors,
                 camera,
                 sh_degree=now.sh_degree,
                 background=background,

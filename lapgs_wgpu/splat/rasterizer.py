@@ -143,7 +143,8 @@ class Rasterizer:
 
     def _draw_band(self, commands: Commands, drawing: Drawing, band: int) -> None:
         device, pool, config, gaussians = self.device, self.pool, self.config, drawing.gaussians
-        n, capacity, tiles = len(gaussians), drawing.plan.capacity, self._band_tiles(drawing, band)
+        (first, last), (_, columns) = self._band_rows(drawing, band), self._tiles(drawing.camera)
+        n, capacity, tiles = len(gaussians), drawing.plan.capacity, (last - first) * columns
         frame = pool.varying(f"frame {band}", lambda: self._frame(drawing, band))
         frame = drawing.move(commands, frame, band) if drawing.move else frame
         names = ("tile counts", "ids", "depth keys", "offsets")
@@ -198,10 +199,6 @@ class Rasterizer:
     def _band_rows(self, drawing: Drawing, band: int) -> tuple[int, int]:
         rows, _ = self._tiles(drawing.camera)
         return rows * band // drawing.plan.bands, rows * (band + 1) // drawing.plan.bands
-
-    def _band_tiles(self, drawing: Drawing, band: int) -> int:
-        first, last = self._band_rows(drawing, band)
-        return (last - first) * self._tiles(drawing.camera)[1]
 
     def _frame(self, drawing: Drawing, band: int) -> bytes:
         camera = drawing.camera
@@ -304,5 +301,5 @@ class Rasterizer:
         for number in range(plan.rounds):
             if plan.rounds > 1:
                 arrays["piece"] = self.pool.constant(kernel.uniform("Piece", number=number, state=tails))
-            commands.run(kernel, self._band_tiles(drawing, band), arrays)
+            commands.run(kernel, arrays["ranges"].shape[0] - 1, arrays)  # a tile each
         commands.run(gather, _groups(len(drawing.gaussians)), arrays)
