@@ -133,7 +133,7 @@ class _Sort:
 
 
 def _sort_counters(rasterizer: Rasterizer, capacity: int, bits: int) -> _Sort:
-    """As gpu/radix_sort.RadixSort divides the keys."""
+    """As gpu/radix_sort divides the keys."""
     bits = max(1, bits)
     if rasterizer.config.lane_runs:
         passes = -(-bits // 8)
