@@ -13,7 +13,7 @@ from math import sqrt
 from lapgs_wgpu.gpu.array import read_all
 from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.gpu.radix_sort import FEW_BLOCKS, FEW_RUNS, runs
-from lapgs_wgpu.motion.fields.hash_grid_config import GridShape
+from lapgs_wgpu.motion.fields.config import GridShape
 from lapgs_wgpu.splat.drawing import Drawing
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 
@@ -133,7 +133,7 @@ class _Sort:
 
 
 def _sort_counters(rasterizer: Rasterizer, capacity: int, bits: int) -> _Sort:
-    """As gpu/radix_sort.RadixSort divides the keys."""
+    """As gpu/radix_sort divides the keys."""
     bits = max(1, bits)
     if rasterizer.config.lane_runs:
         passes = -(-bits // 8)

@@ -9,15 +9,13 @@ from helpers.decoder_reference import decode_reference
 from helpers.trained_scenes import CONFIGS, OURS, trained
 from torch import Tensor, nn
 
-from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
-from lapgs_wgpu.motion.playback import grid_field_playback
-from lapgs_wgpu.motion.playback.grid_field_playback import GridFieldPlayback
-from lapgs_wgpu.motion.playback.playback import activate
+from lapgs_wgpu.motion.playback import playback
+from lapgs_wgpu.motion.playback.playback import DevicePlayback
 from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.splat.gaussians import Gaussians
+from lapgs_wgpu.motion.scene_file import SceneFile
 from lapgs_wgpu.splat.rotation import rotate
 
 pytestmark = pytest.mark.kernels
@@ -46,22 +44,22 @@ def expected(scene: Scene4D, t: float) -> dict[str, Tensor]:
     }
 
 
-def device_field(scene: Scene4D) -> tuple[GridFieldPlayback, Gaussians[DeviceArray]]:
-    """The scene's field without torch, and buffers for what it moves: colors as they are, rubbish elsewhere."""
+def device_field(scene: Scene4D) -> DevicePlayback:
+    """The scene without torch, its buffers of what moves: colors as they are, rubbish elsewhere."""
     assert scene.field is not None
     parameters = {name: value.numpy(force=True) for name, value in scene.field.state_dict().items()}
     stored = {name: value.numpy(force=True) for name, value in scene.parameters.items()}
-    gaussians = activate(stored, scene.sh_degree)
-    rubbish = {name: np.full_like(gaussians[name], np.nan) for name in ("means", "quats", "scales", "opacities")}
-    values = rubbish | {"sh": gaussians["sh"]}
-    out = Gaussians(**{name: DeviceArray.upload(scene.device, name, array) for name, array in values.items()})
-    return GridFieldPlayback(scene.device, scene.field_config, parameters, gaussians), out
+    field = DevicePlayback(SceneFile("", scene.field_config, scene.sh_degree, stored, parameters, {}), scene.device)
+    for name in ("means", "quats", "scales", "opacities"):
+        array = getattr(field._now, name)
+        array.write(np.full(array.shape, np.nan, np.float32))
+    return field
 
 
 def check(scene: Scene4D, times: tuple[float, ...] = (0.37,)) -> None:
-    field, out = device_field(scene)
+    field = device_field(scene)
     for t in times:
-        field.move(t, out)
+        out = field.at(t)
         for name, exact in expected(scene, t).items():
             found = torch.from_numpy(getattr(out, name).read()).double()
             size = exact.abs().amax(dim=tuple(range(1, exact.ndim)), keepdim=True).clamp(min=1)
@@ -81,31 +79,26 @@ def test_any_number_of_gaussians(device: Device, count: int) -> None:
 
 def test_several_blocks(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """As many Gaussians as do not fit into one binding: each dispatch has its own range of the buffers."""
-    monkeypatch.setattr(grid_field_playback, "_BLOCK_BYTES", 1 << 15)
+    monkeypatch.setattr(playback, "_BLOCK_BYTES", 1 << 15)
     check(trained(device, OURS, 1000), (0.2, 0.9, 0.2))
 
 
 def test_no_gaussians(device: Device) -> None:
-    field, out = device_field(trained(device, OURS, 0))
-    field.move(0.5, out)
+    device_field(trained(device, OURS, 0)).at(0.5)
 
 
 def test_only_what_changes_is_written(device: Device) -> None:
     """The colors above their constant part stand in the buffer that is drawn, and stay."""
     scene = trained(device, replace(OURS, appearance="none"), 50)
-    field, out = device_field(scene)
-    before = out.sh.read()
-    field.move(0.4, out)
-    np.testing.assert_array_equal(out.sh.read(), before)
+    field = device_field(scene)
+    before = field._now.sh.read()
+    np.testing.assert_array_equal(field.at(0.4).sh.read(), before)
 
 
 def test_the_same_bits_again(device: Device) -> None:
     scene = trained(device, OURS, 500)
-    field, out = device_field(scene)
-    found = []
-    for t in (0.3, 0.8, 0.3):
-        field.move(t, out)
-        found.append(out.means.read().tobytes())
+    field = device_field(scene)
+    found = [field.at(t).means.read().tobytes() for t in (0.3, 0.8, 0.3)]
     assert found[0] == found[2] != found[1]
 
 

@@ -11,8 +11,8 @@ from helpers.scenes import relative
 from torch import Tensor
 
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.motion.fields.config import TIME, GridShape, HashConfig
 from lapgs_wgpu.motion.fields.hash_encoder import HashEncoder, HashGrid
-from lapgs_wgpu.motion.fields.hash_grid_config import TIME, HashConfig, make_levels
 
 pytestmark = pytest.mark.kernels
 
@@ -209,7 +209,7 @@ def test_nothing_outside_the_box(shaped: Device) -> None:
 
 
 def test_levels_grow_from_the_coarsest_to_the_finest() -> None:
-    levels = make_levels(HashConfig(5, (4, 6, 8), (64, 6, 128), table_log2=12))
+    levels = GridShape(HashConfig(5, (4, 6, 8), (64, 6, 128), table_log2=12), (0, 1, 2)).levels
     assert levels[0].resolution == (4, 6, 8)
     assert levels[-1].resolution == (64, 6, 128)
     assert [level.resolution[0] for level in levels] == [4, 8, 16, 32, 64]

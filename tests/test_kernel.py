@@ -10,10 +10,9 @@ import wgpu
 from numpy.typing import NDArray
 
 from lapgs_wgpu.gpu import shader
-from lapgs_wgpu.gpu.array import Buffer, DeviceArray, read_all
+from lapgs_wgpu.gpu.array import Buffer, BufferPool, DeviceArray, read_all
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.gpu.shader import ShaderError
 
 pytestmark = pytest.mark.kernels

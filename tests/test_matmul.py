@@ -8,10 +8,10 @@ from helpers.scenes import relative
 from torch import Tensor
 
 from lapgs_wgpu.gpu import matmul
+from lapgs_wgpu.gpu.array import BufferPool
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
-from lapgs_wgpu.gpu.matmul import Matmul, Matrix
-from lapgs_wgpu.gpu.pool import BufferPool
+from lapgs_wgpu.gpu.matmul import Matrix, multiply, multiply_long
 
 pytestmark = pytest.mark.kernels
 
@@ -35,10 +35,10 @@ def test_product(
     of_a, of_b = stored(device, a, transposed=a_transposed), stored(device, b, transposed=b_transposed)
     start = random(rows, columns, seed=2)
     fresh, added = on_device(device, torch.full_like(start, torch.nan)), on_device(device, start)
-    product = Matmul(device, BufferPool(device))
+    pool = BufferPool(device)
     with Commands(device) as commands:
-        product(commands, of_a, of_b, Matrix.of(fresh))
-        product(commands, of_a, of_b, Matrix.of(added), add=True)
+        multiply(commands, pool, of_a, of_b, Matrix.of(fresh))
+        multiply(commands, pool, of_a, of_b, Matrix.of(added), add=True)
     exact = a.double() @ b.double()
     assert relative(read(fresh), exact) < 1e-6
     assert relative(read(added), start.double() + exact) < 1e-6
@@ -49,8 +49,9 @@ def test_parts_of_matrices(device: Device) -> None:
     a, b, c = random(150, 40), random(33, 90, seed=1), random(140, 80, seed=2)
     result = on_device(device, c)
     with Commands(device) as commands:
-        Matmul(device, BufferPool(device))(
+        multiply(
             commands,
+            BufferPool(device),
             Matrix.of(on_device(device, a).rows(64, 70)).from_column(3, 33),
             Matrix.of(on_device(device, b)).from_column(20, 65),
             Matrix.of(result.rows(64, 70)).from_column(11, 65),
@@ -71,14 +72,14 @@ def test_long_products_are_sums_of_parts(device: Device, inner: int, monkeypatch
     a, b, start = random(inner, 70), random(inner, 9, seed=1), random(70, 15, seed=2)
     fresh, added = on_device(device, torch.full((70, 9), torch.nan)), on_device(device, start)
     of_a, of_b = (Matrix.of(on_device(device, x)) for x in (a, b))
-    product = Matmul(device, BufferPool(device))
+    pool = BufferPool(device)
     runs = []
     for _ in range(2):
         with Commands(device) as commands:
-            product.split_k(commands, of_a.transpose, of_b, Matrix.of(fresh))
+            multiply_long(commands, pool, of_a.transpose, of_b, Matrix.of(fresh))
         runs.append(read(fresh))
     with Commands(device) as commands:
-        product.split_k(commands, of_a.transpose, of_b, Matrix.of(added).from_column(4, 9), add=True)
+        multiply_long(commands, pool, of_a.transpose, of_b, Matrix.of(added).from_column(4, 9), add=True)
     exact = a.double().T @ b.double()
     assert torch.equal(*runs)
     assert relative(runs[0], exact) < 1e-6
@@ -91,5 +92,5 @@ def test_long_sums_are_accurate(device: Device) -> None:
     total = on_device(device, torch.zeros(1, 1))
     column = Matrix.of(on_device(device, ones))
     with Commands(device) as commands:
-        Matmul(device, BufferPool(device)).split_k(commands, column.transpose, column, Matrix.of(total))
+        multiply_long(commands, BufferPool(device), column.transpose, column, Matrix.of(total))
     assert float(read(total)) == pytest.approx(20_000 * float(np.float32(0.1)) ** 2, rel=2e-5)

@@ -5,11 +5,9 @@ import pytest
 from numpy.typing import NDArray
 
 from lapgs_wgpu.gpu import radix_sort
-from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
-from lapgs_wgpu.gpu.pool import BufferPool
-from lapgs_wgpu.gpu.radix_sort import RadixSort
 
 pytestmark = pytest.mark.kernels
 
@@ -41,13 +39,9 @@ def sort(
         if words is not None:
             held[name] = DeviceArray.upload(device, name, words)
     with Commands(device) as commands:
-        sorted_keys, carried = RadixSort(device, pool or BufferPool(device), "test", lane_runs=lane_runs)(
-            commands,
-            length=held["length"],
-            capacity=len(keys),
-            bits=bits,
-            keys=held["keys"],
-            payload=held.get("payload"),
+        given = held["length"], held["keys"], held.get("payload")
+        sorted_keys, carried = radix_sort.radix_sort(
+            commands, pool or BufferPool(device), "test", *given, bits=bits, lane_runs=lane_runs
         )
     count = min(length, len(keys))
     return sorted_keys.read()[:count], carried.read()[:count]

@@ -10,11 +10,10 @@ from helpers.matrices import on_device, random, read
 from helpers.scenes import relative
 from torch import Tensor, nn
 
-from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.matmul import sum_columns
-from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.dynamics import dynamics_loss
 from lapgs_wgpu.motion.fields.laplacian import VARIANCE_FLOOR, VARIANCE_SPREAD, LaplacianMotion
@@ -233,7 +232,7 @@ def test_steps_of_corrections(device: Device, guard: int) -> None:
         corrections._d_camera.write(nn.functional.pad(d_camera.reshape(2, 3), (0, 1)).flatten().numpy())
         corrections._d_exposure.write(d_colors.numpy())
         with Commands(device) as commands:
-            frame = corrections.move(commands, drawing.frames[0], 0)
+            frame = corrections.move(commands, drawing.arrays["frame"], 0)
             corrections.record_step(commands, word(device, guard), frame, on_device(device, geometry))
         view = frame.read().view(np.float32)[:16].reshape(4, 4).T
         np.testing.assert_allclose(view, exact.refined(cameras[number]).T_cam_world, atol=2e-5)

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
-from lapgs_wgpu.gpu.pool import BufferPool
-from lapgs_wgpu.gpu.scan import Scan
+from lapgs_wgpu.gpu.scan import scan as scan_on_device
 
 pytestmark = pytest.mark.kernels
 
@@ -28,18 +27,19 @@ def scan(
 ) -> tuple[Words, int]:
     """The first `length` sums and the total. Fails where anything else was written."""
     capacity = length if capacity is None else capacity
-    pool = BufferPool(device)
     prefix = DeviceArray.upload(device, "prefix", np.full(capacity + 64, UNTOUCHED, np.uint32))
     total = DeviceArray.upload(device, "total", np.full(4, UNTOUCHED, np.uint32))
     picked = {} if indices is None else {"indices": DeviceArray.upload(device, "indices", indices)}
     with Commands(device) as commands:
-        Scan(device, pool, "test", source)(
+        scan_on_device(
             commands,
+            BufferPool(device),
+            "test",
             length=DeviceArray.upload(device, "length", np.array([length], np.uint32)),
-            capacity=capacity,
             values=DeviceArray.upload(device, "values", values),
-            prefix=prefix,
+            prefix=prefix.rows(0, capacity),
             total=total,
+            flags=source == "flags",
             **picked,
         )
     sums = prefix.read()

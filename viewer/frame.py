@@ -6,8 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lapgs_wgpu.gpu.array import DeviceArray
-from lapgs_wgpu.gpu.pool import BufferPool
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.motion.playback.playback import Playback
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rasterizer import Rasterizer
@@ -68,7 +67,7 @@ class FrameRenderer:
         gaussians = dataclasses.replace(self.playback.at(request.time), **changes)
         depths = request.mode == "depth"
         drawing = self._rasterizer.draw_whole(gaussians, request.camera, background, depth=depths)
-        splats = int(drawing.lists.visible.read()[0])
+        splats = int(drawing.arrays["visible"].read()[0])
         if depths:
             rest, depth = drawing.image.read()[3:]
             seen = rest < 0.5

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from lapgs_wgpu.data.poses import world_to_camera
 from lapgs_wgpu.data.stamps import natural_key
 from lapgs_wgpu.errors import InputError, optional_module
-from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.io.ply import GaussianSnapshot, vertex_of
 from lapgs_wgpu.io.ply_elements import Floats, open_ply

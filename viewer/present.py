@@ -6,8 +6,8 @@ import numpy as np
 import wgpu
 from numpy.typing import NDArray
 
+from lapgs_wgpu.gpu.array import BufferPool
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.gpu.shader import compose, pack
 from lapgs_wgpu.viewer.frame import Frame
 from lapgs_wgpu.viewer.render_modes import Mode

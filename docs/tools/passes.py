@@ -54,10 +54,8 @@ def passes_of(gaussians: Gaussians[torch.Tensor], camera: Camera) -> Passes:
     drawing: Drawing = rasterizer.draw(arrays, camera)
     while rasterizer.grow_on_overflow(drawing):
         drawing = rasterizer.draw(arrays, camera)
-    lists = drawing.lists
-    image, splats, order, visible, ranges = read_all(
-        [drawing.image, drawing.splats, lists.ids, lists.visible, lists.ranges]
-    )
+    names = ("image", "splats", "ids", "visible", "ranges")
+    image, splats, order, visible, ranges = read_all([drawing.arrays[name] for name in names])
     config = rasterizer.config
     tiles = camera.height // config.tile_height, camera.width // config.tile_width
     return Passes(image, splats, order[: int(visible[0])], ranges[:-1], tiles)

@@ -59,16 +59,11 @@ def instance_options(platform: str) -> dict[str, Any]:
     D3D12 is left out without dxcompiler.dll, since its older compiler, FXC, knows no subgroups and refuses barriers in
     loops.
     """
+    dxc = ctypes.util.find_library("dxcompiler") if platform == "win32" else None
     # Not OpenGL: it offers the same hardware with fewer features.
-    backends = ["Vulkan", "Metal", "DX12"]
+    backends = ["Vulkan", "Metal", "DX12"] if dxc or platform != "win32" else ["Vulkan", "Metal"]
     options: dict[str, Any] = {"backends": backends, "flags": ["Empty"]}
-    if platform == "win32":
-        dxc = ctypes.util.find_library("dxcompiler")
-        if dxc is None:
-            backends.remove("DX12")
-        else:
-            options |= {"dx12_compiler": "Dxc", "dxc_path": dxc}
-    return options
+    return options | ({"dx12_compiler": "Dxc", "dxc_path": dxc} if dxc else {})
 
 
 @functools.cache

@@ -2,10 +2,8 @@
 
 from dataclasses import dataclass, replace
 
-from lapgs_wgpu.gpu.array import DeviceArray
-from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.gpu.pool import BufferPool
 
 _TILE = 64  # matmul.wgsl
 _SPLIT = 1 << 11  # inner elements of a partial sum where the inner dimension is split
@@ -41,37 +39,34 @@ class Matrix:
         return replace(self, first=self.first + first, columns=count)
 
 
-class Matmul:
-    """Records matrix products. Sums have a fixed order, so results are the same to the last bit on every run."""
+def multiply(
+    commands: Commands, pool: BufferPool, a: Matrix, b: Matrix, c: Matrix, *, add: bool = False, split: int = 0
+) -> None:
+    """Record c = a b, or c += a b with `add`; c must not be transposed. Sums have a fixed order, hence the same bits.
 
-    def __init__(self, device: Device, pool: BufferPool) -> None:
-        self._device, self._pool = device, pool
+    split: inner elements of each of the partial sums, which follow one another in c; 0: all.
+    """
+    split = split or a.columns
+    kernel = Kernel.get(pool.device, "matmul", ADD=add, A_INNER=not a.transposed, B_INNER=b.transposed)
+    sizes = {"rows": c.rows, "columns": c.columns, "inner": a.columns, "split": split}
+    places = {"a_stride": a.stride, "b_stride": b.stride, "c_stride": c.stride, "c_part": c.rows * c.columns}
+    content = kernel.uniform("Matmul", **sizes, **places, first=(a.first, b.first, c.first, 0))
+    groups = -(-c.rows // _TILE) * -(-c.columns // _TILE) * -(-a.columns // split)
+    commands.dispatch(kernel, groups, product=pool.constant(content), a=a.array, b=b.array, c=c.array)
 
-    def __call__(self, commands: Commands, a: Matrix, b: Matrix, c: Matrix, *, add: bool = False) -> None:
-        """Record c = a b, or c += a b with `add`. c must not be transposed."""
-        self._dispatch(commands, a, b, c, a.columns, add=add)
 
-    def split_k(self, commands: Commands, a: Matrix, b: Matrix, c: Matrix, *, add: bool = False) -> None:
-        """Record c = a b, or c += a b with `add`, for a long inner dimension.
+def multiply_long(commands: Commands, pool: BufferPool, a: Matrix, b: Matrix, c: Matrix, *, add: bool = False) -> None:
+    """Record `multiply` for a long inner dimension.
 
-        The dimension is split, which occupies the device and keeps partial sums short, hence accurate.
-        """
-        count = -(-a.columns // _SPLIT)
-        parts = self._pool.array("parts", (count, a.rows, b.columns))
-        self._dispatch(commands, a, b, Matrix(parts, a.rows, b.columns, b.columns), _SPLIT)
-        kernel = Kernel.get(self._device, "matmul_sum", ADD=add)
-        place = {"columns": c.columns, "stride": c.stride, "first": c.first}
-        uniform = self._pool.constant(kernel.uniform("Sum", count=a.rows * b.columns, parts=count, **place))
-        commands.dispatch(kernel, -(-a.rows * b.columns // 64), sum=uniform, parts=parts, total=c.array)
-
-    def _dispatch(self, commands: Commands, a: Matrix, b: Matrix, c: Matrix, split: int, *, add: bool = False) -> None:
-        kernel = Kernel.get(self._device, "matmul", ADD=add, A_INNER=not a.transposed, B_INNER=b.transposed)
-        sizes = {"rows": c.rows, "columns": c.columns, "inner": a.columns, "split": split}
-        places = {"a_stride": a.stride, "b_stride": b.stride, "c_stride": c.stride, "c_part": c.rows * c.columns}
-        first = (a.first, b.first, c.first, 0)
-        product = self._pool.constant(kernel.uniform("Matmul", **sizes, **places, first=first))
-        groups = -(-c.rows // _TILE) * -(-c.columns // _TILE) * -(-a.columns // split)
-        commands.dispatch(kernel, groups, product=product, a=a.array, b=b.array, c=c.array)
+    The dimension is split, which occupies the device and keeps partial sums short, hence accurate.
+    """
+    count = -(-a.columns // _SPLIT)
+    parts = pool.array("parts", (count, a.rows, b.columns))
+    multiply(commands, pool, a, b, Matrix(parts, a.rows, b.columns, b.columns), split=_SPLIT)
+    kernel = Kernel.get(pool.device, "matmul_sum", ADD=add)
+    place = {"columns": c.columns, "stride": c.stride, "first": c.first}
+    uniform = pool.constant(kernel.uniform("Sum", count=a.rows * b.columns, parts=count, **place))
+    commands.dispatch(kernel, -(-a.rows * b.columns // 64), sum=uniform, parts=parts, total=c.array)
 
 
 def sum_columns(
@@ -85,6 +80,6 @@ def sum_columns(
     factor: float = 1.0,
 ) -> None:
     """Record the sums of the columns of values, times a factor, into `totals` from `place` on."""
-    kernel = Kernel.get(commands.device, "sum_values")
+    kernel = Kernel.get(pool.device, "sum_values")
     content = kernel.uniform("Values", rows=values.size // columns, columns=columns, place=place, factor=factor)
     commands.dispatch(kernel, columns, sum=pool.constant(content), values=values, totals=totals)

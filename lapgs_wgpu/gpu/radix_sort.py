@@ -2,11 +2,9 @@
 
 import struct
 
-from lapgs_wgpu.gpu.array import DeviceArray
-from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.gpu.pool import BufferPool
-from lapgs_wgpu.gpu.scan import Scan
+from lapgs_wgpu.gpu.scan import scan
 
 _SORT_BLOCK_ITEMS = 2048  # common/sort.wgsl: 128 lanes x 16 elements
 # Of runs, and of blocks: adding up their counters in each lane, or workgroup, takes less time than a scan's dispatches.
@@ -18,62 +16,50 @@ def runs(capacity: int) -> int:
     return 16 if capacity <= 8 * 4096 else 8 * min(128, max(4, capacity // (8 * 4096)))
 
 
-class RadixSort:
-    """A stable sort of u32 keys with a u32 payload, least significant digit first.
+def radix_sort(
+    commands: Commands,
+    pool: BufferPool,
+    name: str,
+    length: DeviceArray,
+    keys: DeviceArray,
+    payload: DeviceArray | None,
+    *,
+    bits: int,
+    lane_runs: bool,
+) -> tuple[DeviceArray, DeviceArray]:
+    """Sort the first length[0] <= keys.size u32 keys, with a u32 payload, by their lowest `bits` bits. Stable.
 
+    The least significant digit comes first. payload: None stands for 0, 1, 2, ... `keys` and `payload` are overwritten.
     lane_runs: variant for CPU devices: digits of up to 8 bits, a run of elements per lane. Otherwise 4-bit digits are
-    ranked in workgroups. Both give the same result.
+    ranked in workgroups. Both give the same result. Returns sorted keys and payload.
     """
-
-    def __init__(self, device: Device, pool: BufferPool, name: str, *, lane_runs: bool) -> None:
-        self._device, self._pool, self._name, self._lane_runs = device, pool, name, lane_runs
-        self._scan = Scan(device, pool, name)
-
-    def __call__(
-        self,
-        commands: Commands,
-        *,
-        length: DeviceArray,
-        capacity: int,
-        bits: int,
-        keys: DeviceArray,
-        payload: DeviceArray | None,
-    ) -> tuple[DeviceArray, DeviceArray]:
-        """Sort the first length[0] <= capacity elements by the lowest `bits` bits of their keys.
-
-        payload: None stands for 0, 1, 2, ... `keys` and `payload` are overwritten. Returns sorted keys and payload.
-        """
-        widest = 8 if self._lane_runs else 4
-        passes = -(-bits // widest)
-        width = -(-bits // passes) if self._lane_runs else widest
-        digits = 1 << width
-        owners = runs(capacity) if self._lane_runs else -(-capacity // _SORT_BLOCK_ITEMS)
-        unsummed = owners <= (FEW_RUNS if self._lane_runs else FEW_BLOCKS)
-        counters = self._pool.array(f"{self._name} counters", (digits * owners,), "uint32")
-        keys_out = self._pool.array(f"{self._name} keys", (capacity,), "uint32")
-        payload_out = self._pool.array(f"{self._name} payload", (capacity,), "uint32")
-        second_payload = payload or self._pool.array(f"{self._name} second payload", (capacity,), "uint32")
-        groups = owners // 8 if self._lane_runs else owners
-        count_kernel = Kernel.get(self._device, "sort_count", LANE_RUNS=self._lane_runs)
-        for step in range(passes):
-            sizes = {"shift": step * width, "digits": digits, "owners": owners, "capacity": capacity}
-            uniform = self._pool.constant(count_kernel.uniform("Sort", **sizes))
-            arrays = {"sort": uniform, "length": length, "keys": keys}
-            commands.dispatch(count_kernel, groups, counters=counters, **arrays)
-            places = counters if unsummed else self._summed(commands, counters)
-            arrays |= {"counters": places, "keys_out": keys_out, "payload_out": payload_out, "payload": second_payload}
-            iota = step == 0 and payload is None
-            scatter = Kernel.get(self._device, "sort_scatter", LANE_RUNS=self._lane_runs, UNSUMMED=unsummed, IOTA=iota)
-            commands.run(scatter, groups, arrays)
-            keys, keys_out = keys_out, keys
-            second_payload, payload_out = payload_out, second_payload
-        return keys, second_payload
-
-    def _summed(self, commands: Commands, counters: DeviceArray) -> DeviceArray:
-        """Return the counters' exclusive prefix sums: the place of each counter's first element."""
-        (count,) = counters.shape
-        places = self._pool.array(f"{self._name} places", (count,), "uint32")
-        total = self._pool.array(f"{self._name} total", (1,), "uint32")
-        length = self._pool.constant(struct.pack("<I", count))
-        self._scan(commands, length=length, capacity=count, values=counters, prefix=places, total=total)
-        return places
+    capacity = keys.size
+    widest = 8 if lane_runs else 4
+    passes = -(-bits // widest)
+    width = -(-bits // passes) if lane_runs else widest
+    digits = 1 << width
+    owners = runs(capacity) if lane_runs else -(-capacity // _SORT_BLOCK_ITEMS)
+    unsummed = owners <= (FEW_RUNS if lane_runs else FEW_BLOCKS)
+    count = digits * owners
+    counters = places = pool.array(f"{name} counters", (count,), "uint32")
+    keys_out = pool.array(f"{name} keys", (capacity,), "uint32")
+    payload_out = pool.array(f"{name} payload", (capacity,), "uint32")
+    second_payload = payload or pool.array(f"{name} second payload", (capacity,), "uint32")
+    groups = owners // 8 if lane_runs else owners
+    count_kernel = Kernel.get(pool.device, "sort_count", LANE_RUNS=lane_runs)
+    for step in range(passes):
+        sizes = {"shift": step * width, "digits": digits, "owners": owners, "capacity": capacity}
+        uniform = pool.constant(count_kernel.uniform("Sort", **sizes))
+        arrays = {"sort": uniform, "length": length, "keys": keys}
+        commands.dispatch(count_kernel, groups, counters=counters, **arrays)
+        if not unsummed:  # their exclusive prefix sums: the place of each counter's first element
+            places = pool.array(f"{name} places", (count,), "uint32")
+            total, all_of_them = pool.array(f"{name} total", (1,), "uint32"), pool.constant(struct.pack("<I", count))
+            scan(commands, pool, name, length=all_of_them, values=counters, prefix=places, total=total)
+        arrays |= {"counters": places, "keys_out": keys_out, "payload_out": payload_out, "payload": second_payload}
+        iota = step == 0 and payload is None
+        scatter = Kernel.get(pool.device, "sort_scatter", LANE_RUNS=lane_runs, UNSUMMED=unsummed, IOTA=iota)
+        commands.run(scatter, groups, arrays)
+        keys, keys_out = keys_out, keys
+        second_payload, payload_out = payload_out, second_payload
+    return keys, second_payload

@@ -14,26 +14,19 @@ from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.gaussians import Gaussians
 
 
-class TileLists(NamedTuple):
-    """The sorted lists of splats of a band's tiles."""
-
-    tile_counts: DeviceArray  # (N,) uint32, tiles of each Gaussian; 0: not visible
-    visible: DeviceArray  # (1,) uint32, number of Gaussians in the lists
-    ids: DeviceArray  # (N,) uint32, the first visible[0] of them, by depth
-    offsets: DeviceArray  # (N,) uint32, first slot of each of these
-    slot_ids: DeviceArray  # (capacity,) uint32, the Gaussian of each slot
-    slots: DeviceArray  # (capacity,) uint32, by tile and depth
-    ranges: DeviceArray  # (tiles + 1, 4) uint32: first, end and drawn end of a tile's part of `slots`; then flags
-
-
 @dataclass(eq=False)
 class Drawing:
     """A submitted image. Its arrays are valid until the rasterizer draws another one.
 
     image: (4, H, W) red, green, blue, transmittance; with `depth` (5, H, W), the last plane is the sum of weight times
     camera depth. splats: (N, SPLAT_FLOATS), see constants. needed: (3,) uint32 per band: number of intersections;
-    unused; whether a list needs more rounds. lists: of the band drawn last. number: counts the rasterizer's drawings.
-    frames: what each band's passes share. move: given a band's frame, records that of the moved camera, if it moves.
+    unused; whether a list needs more rounds. number: counts the rasterizer's drawings. move: given a band's frame,
+    records that of the moved camera, if it moves.
+    arrays: by name what the passes of the band drawn last bind. Among them are the sorted lists of its tiles, uint32:
+    tile_counts (N,) tiles of each Gaussian, 0 if it is not visible; visible (1,) number of Gaussians in the lists; ids
+    (N,) the first visible[0] of them, by depth; offsets (N,) first slot of each of these; slot_ids (capacity,) the
+    Gaussian of each slot; slots (capacity,) by tile and depth; ranges (tiles + 1, 4) first, end and drawn end of a
+    tile's part of `slots`, then flags.
     """
 
     gaussians: Gaussians[DeviceArray]
@@ -46,8 +39,7 @@ class Drawing:
     splats: DeviceArray
     needed: list[DeviceArray]
     move: Callable[[Commands, DeviceArray, int], DeviceArray] | None = None
-    lists: TileLists = field(init=False)
-    frames: dict[int, DeviceArray] = field(default_factory=dict)
+    arrays: dict[str, DeviceArray] = field(default_factory=dict)
 
 
 def sh_defines(degree: int | None) -> dict[str, int]:
@@ -77,18 +69,8 @@ class GaussianGradients(NamedTuple):
         return [array for array in self[:5] if array is not None]
 
 
-class CameraGradient(NamedTuple):
-    """Gradients with respect to a camera.
-
-    rotation: (3,) by a small rotation of the camera about its own center, a vector along the world's axes, radians.
-    position: (3,) by the center, world units.
-    """
-
-    rotation: NDArray[np.float64]
-    position: NDArray[np.float64]
-
-
-def camera_gradient(sums: NDArray[np.float32]) -> CameraGradient:
-    """Return the gradient by the camera from the content of `GaussianGradients.camera`."""
+def camera_gradient(sums: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the gradient by a camera from the content of `GaussianGradients.camera`: (3,) by a small rotation of the
+    camera about its own center, a vector along the world's axes, radians; (3,) by the center, world units."""
     turn, shift = sums.sum(axis=1, dtype=np.float64)
-    return CameraGradient(-turn[:3], -shift[:3])
+    return -turn[:3], -shift[:3]

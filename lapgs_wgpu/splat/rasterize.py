@@ -8,9 +8,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lapgs_wgpu.gpu.array import DeviceArray, read_all
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray, read_all
 from lapgs_wgpu.gpu.device import Device, open_device
-from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.constants import COLOR, CONSTANTS, MEAN, OPACITY, RADIUS
 from lapgs_wgpu.splat.drawing import camera_gradient

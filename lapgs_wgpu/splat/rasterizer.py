@@ -12,16 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import DeviceMemoryError
-from lapgs_wgpu.gpu.array import DeviceArray, read_all
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray, read_all
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.gpu.pool import BufferPool
-from lapgs_wgpu.gpu.radix_sort import RadixSort
-from lapgs_wgpu.gpu.scan import Scan
+from lapgs_wgpu.gpu.radix_sort import radix_sort
+from lapgs_wgpu.gpu.scan import scan
 from lapgs_wgpu.splat.buffer_plan import BufferPlan, BufferPlans, roomy
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.constants import SPLAT_FLOATS
-from lapgs_wgpu.splat.drawing import Drawing, GaussianGradients, TileLists, sh_defines
+from lapgs_wgpu.splat.drawing import Drawing, GaussianGradients, sh_defines
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.raster_config import MAX_BAND_TILES, RasterConfig, raster_config
 
@@ -46,10 +45,6 @@ class Rasterizer:
         self.pool = BufferPool(device)
         self.plans = BufferPlans(capacity)
         self.max_capacity = device.max_binding // (4 * _RECORD_FLOATS)
-        self._flags_scan = Scan(device, self.pool, "visible", "flags")
-        self._offset_scan = Scan(device, self.pool, "offsets", "gather")
-        self._depth_sort = RadixSort(device, self.pool, "depth sort", lane_runs=self.config.lane_runs)
-        self._tile_sort = RadixSort(device, self.pool, "tile sort", lane_runs=self.config.lane_runs)
         self._drawings = 0
         self._trusted: set[tuple[str, bool, bool]] = set()  # passes whose subgroups were checked
 
@@ -98,20 +93,14 @@ class Rasterizer:
             bands = max(self.plans.now.bands, -(-rows // max(1, MAX_BAND_TILES // columns)))
             self.plans.now = replace(self.plans.now, bands=bands)
         self._drawings += 1
-        drawing = Drawing(
-            gaussians,
-            camera,
-            background,
-            depth,
-            self.plans.now,
-            self._drawings,
-            image=self.pool.array("image", (5 if depth else 4, camera.height, camera.width)),
-            splats=self.pool.array("splats", (len(gaussians), SPLAT_FLOATS)),
-            needed=[self.pool.array(f"needed {band}", (3,), "uint32") for band in range(self.plans.now.bands)],
-            move=move,
-        )
-        for band in range(drawing.plan.bands):
-            drawing.lists = self._draw_band(commands, drawing, band)
+        plan, pool = self.plans.now, self.pool
+        image = pool.array("image", (5 if depth else 4, camera.height, camera.width))
+        splats = pool.array("splats", (len(gaussians), SPLAT_FLOATS))
+        needed = [pool.array(f"needed {band}", (3,), "uint32") for band in range(plan.bands)]
+        shown = gaussians, camera, background, depth
+        drawing = Drawing(*shown, plan, self._drawings, image, splats, needed, move)
+        for band in range(plan.bands):
+            self._draw_band(commands, drawing, band)
             commands.flush()
         return drawing
 
@@ -152,18 +141,19 @@ class Rasterizer:
         self.plans.now = replace(plan, capacity=min(limit, roomy(most)), bands=bands)
         return True
 
-    def _draw_band(self, commands: Commands, drawing: Drawing, band: int) -> TileLists:
+    def _draw_band(self, commands: Commands, drawing: Drawing, band: int) -> None:
         device, pool, config, gaussians = self.device, self.pool, self.config, drawing.gaussians
-        n, capacity, tiles = len(gaussians), drawing.plan.capacity, self._band_tiles(drawing, band)
+        (first, last), (_, columns) = self._band_rows(drawing, band), self._tiles(drawing.camera)
+        n, capacity, tiles = len(gaussians), drawing.plan.capacity, (last - first) * columns
         frame = pool.varying(f"frame {band}", lambda: self._frame(drawing, band))
-        frame = drawing.frames[band] = drawing.move(commands, frame, band) if drawing.move else frame
+        frame = drawing.move(commands, frame, band) if drawing.move else frame
         names = ("tile counts", "ids", "depth keys", "offsets")
         tile_counts, ids, keys, offsets = (pool.array(name, (n,), "uint32") for name in names)
         needed, visible = drawing.needed[band], pool.array("visible", (1,), "uint32")
         tile_keys, slot_ids = (pool.array(name, (capacity,), "uint32") for name in ("tile keys", "slot ids"))
         ranges = pool.array("ranges", (tiles + 1, 4), "uint32")
         length = pool.constant(n.to_bytes(4, "little"))
-        arrays = gaussians.arrays() | {"frame": frame, "needed": needed}
+        arrays = drawing.arrays = gaussians.arrays() | {"frame": frame, "needed": needed}
         arrays |= {"splats": drawing.splats, "image": drawing.image}
         arrays |= {"tile_counts": tile_counts, "ids": ids, "keys": keys, "prefix": offsets, "visible": visible}
         arrays |= {"offsets": offsets, "tile_keys": tile_keys, "slot_ids": slot_ids, "ranges": ranges}
@@ -171,15 +161,15 @@ class Rasterizer:
             commands.clear(needed)
         commands.run(Kernel.get(device, "project", **config.tile_defines), _groups(n), arrays)
         self._color(commands, "color", drawing, arrays, colors=gaussians.sh)
-        self._flags_scan(commands, length=length, capacity=n, values=tile_counts, prefix=offsets, total=visible)
+        scan(commands, pool, "visible", length=length, values=tile_counts, prefix=offsets, total=visible, flags=True)
         commands.run(Kernel.get(device, "compact"), _groups(n), arrays)
-        _, arrays["ids"] = self._depth_sort(commands, length=visible, capacity=n, bits=32, keys=keys, payload=ids)
-        scanned = {"values": tile_counts, "indices": arrays["ids"], "prefix": offsets, "total": needed}
-        self._offset_scan(commands, length=visible, capacity=n, **scanned)
+        _, ids = radix_sort(commands, pool, "depth sort", visible, keys, ids, bits=32, lane_runs=config.lane_runs)
+        arrays["ids"] = ids
+        scan(commands, pool, "offsets", length=visible, values=tile_counts, prefix=offsets, total=needed, indices=ids)
         commands.run(Kernel.get(device, "duplicate_with_keys", **config.tile_defines), _groups(n), arrays)
         bits = max(1, tiles.bit_length())  # one key more than there are tiles, for pads
-        arrays["tile_keys"], arrays["slots"] = self._tile_sort(
-            commands, length=needed, capacity=capacity, bits=bits, keys=tile_keys, payload=None
+        arrays["tile_keys"], arrays["slots"] = radix_sort(
+            commands, pool, "tile sort", needed, tile_keys, None, bits=bits, lane_runs=config.lane_runs
         )
         commands.clear(ranges)
         commands.run(Kernel.get(device, "tile_ranges"), _groups(-(-capacity // 4)), arrays)
@@ -188,7 +178,6 @@ class Rasterizer:
             if config.round_splats:
                 defines |= {"CONTINUED": number > 0, "LAST_ROUND": number == drawing.plan.rounds - 1}
             commands.run(Kernel.get(device, "rasterize", **defines), tiles, arrays)
-        return TileLists(*(arrays[name] for name in TileLists._fields))
 
     def _color(
         self, commands: Commands, name: str, drawing: Drawing, arrays: Mapping[str, DeviceArray], **rows: DeviceArray
@@ -210,10 +199,6 @@ class Rasterizer:
     def _band_rows(self, drawing: Drawing, band: int) -> tuple[int, int]:
         rows, _ = self._tiles(drawing.camera)
         return rows * band // drawing.plan.bands, rows * (band + 1) // drawing.plan.bands
-
-    def _band_tiles(self, drawing: Drawing, band: int) -> int:
-        first, last = self._band_rows(drawing, band)
-        return (last - first) * self._tiles(drawing.camera)[1]
 
     def _frame(self, drawing: Drawing, band: int) -> bytes:
         camera = drawing.camera
@@ -243,7 +228,7 @@ class Rasterizer:
         if not self.config.subgroups or key in self._trusted:
             return False
         self._trusted.add(key)
-        ranges = drawing.lists.ranges
+        ranges = drawing.arrays["ranges"]
         flags = ranges.rows(ranges.shape[0] - 1, 1).read()[0]
         if not flags[3 if name == "rasterize_bwd" else 2]:
             return False
@@ -281,7 +266,7 @@ class Rasterizer:
         d_means, d_scales = self.pool.array("d_means", (n, 3)), self.pool.array("d_scales", (n, 3))
         d_quats = self.pool.array("d_quats", (n, 4))
         d_sh = d_camera = None
-        arrays = gaussians.arrays() | {"frame": drawing.frames[0], "d_splats": d_splats}
+        arrays = drawing.arrays | {"d_splats": d_splats}
         arrays |= {"d_means": d_means, "d_quats": d_quats, "d_scales": d_scales}
         commands.run(Kernel.get(self.device, "project_bwd"), _groups(n), arrays)
         if camera:  # a row for each workgroup of camera_bwd, twice; each half begins at a multiple of 256 bytes
@@ -300,8 +285,8 @@ class Rasterizer:
         self, commands: Commands, drawing: Drawing, band: int, d_image: DeviceArray, d_splats: DeviceArray
     ) -> None:
         if drawing.plan.bands > 1:  # the lists of the other bands are gone
-            drawing.lists = self._draw_band(commands, drawing, band)
-        lists, plan = drawing.lists, drawing.plan
+            self._draw_band(commands, drawing, band)
+        plan = drawing.plan
         records = self.pool.array("records", (plan.capacity, _RECORD_FLOATS))
         tails = (3 if drawing.depth else 2) * plan.capacity
         states = 2 * drawing.camera.width * drawing.camera.height if plan.rounds > 1 else 0
@@ -309,13 +294,12 @@ class Rasterizer:
         defines = self.config.raster_defines(depth=drawing.depth)
         kernel = Kernel.get(self.device, "rasterize_bwd", ROUNDS=plan.rounds > 1, **defines)
         gather = Kernel.get(self.device, "gather_gradients", DEPTH=drawing.depth)
-        arrays = lists._asdict() | {"frame": drawing.frames[band]}
-        arrays |= {"splats": drawing.splats, "image": drawing.image, "d_image": d_image, "d_splats": d_splats}
+        arrays = drawing.arrays | {"d_image": d_image, "d_splats": d_splats}
         arrays |= {"records": records, "record_tails": record_tails}
         arrays["tails"] = self.pool.constant(gather.uniform("Tails", capacity=plan.capacity))
         commands.clear(record_tails.rows(0, plan.capacity))  # no slot has a record yet
         for number in range(plan.rounds):
             if plan.rounds > 1:
                 arrays["piece"] = self.pool.constant(kernel.uniform("Piece", number=number, state=tails))
-            commands.run(kernel, self._band_tiles(drawing, band), arrays)
+            commands.run(kernel, arrays["ranges"].shape[0] - 1, arrays)  # a tile each
         commands.run(gather, _groups(len(drawing.gaussians)), arrays)

@@ -60,7 +60,7 @@ def render_loss(
     background: (3,) in [0, 1], under the rendering; not differentiable. correction: (3, 4) of the image's colors before
     they are compared (train/exposure). own: further terms of the image, with their weights. camera_change: (6,) zeros,
     which get the gradient by a small change of the camera: rotation, shift in units of `camera_unit`, world units
-    (splat.drawing.CameraGradient).
+    (splat.drawing.camera_gradient).
     """
     rasterizer, losses, exposing = rasterizer_of(device), image_loss_of(device), exposure_of(device)
     arrays, (red, green, blue) = upload_gaussians(rasterizer.pool, gaussians), background.tolist()
@@ -93,8 +93,8 @@ def render_loss(
     if correction is not None:
         by_correction = correction.new_tensor(d_rows[0].sum(axis=0, dtype=np.float64))
     if camera_change is not None:
-        by = camera_gradient(d_rows[-1])
-        by_camera = camera_change.new_tensor([*by.rotation, *(camera_unit * by.position)])
+        by_rotation, by_center = camera_gradient(d_rows[-1])
+        by_camera = camera_change.new_tensor([*by_rotation, *(camera_unit * by_center)])
     radii, means2d = radii_and_centres(splats, gaussians.means.device)
     means2d.requires_grad_()
     computed = np.append(values.astype(np.float64), own_values)

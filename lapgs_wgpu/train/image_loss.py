@@ -6,10 +6,9 @@ device.
 
 import numpy as np
 
-from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.train.config import LossWeights
 
 TERMS = 5  # in the buffer that `record` leaves

@@ -4,10 +4,9 @@ import numpy as np
 import torch
 
 from lapgs_wgpu.data.views import View
-from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.matmul import sum_columns
-from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.train.camera_refinement import MOST_POINTS, CameraRefinement, Pace
 from lapgs_wgpu.train.exposure import Exposures
 from lapgs_wgpu.train.fused_loss import exposure_of

@@ -13,9 +13,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lapgs_wgpu.gpu.array import DeviceArray, read_all
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray, read_all
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.laplacian import VARIANCE_FLOOR, VARIANCE_SPREAD
 from lapgs_wgpu.motion.passes.activation_passes import GEOMETRY_FLOATS, SH_FLOATS
 from lapgs_wgpu.motion.passes.grid_field_passes import FieldArrays, GridFieldPasses
@@ -177,10 +176,10 @@ class ResidentParameters:
     def arrays(self, kind: str) -> FieldArrays:
         """What the field computes with (kind "value"), or its gradients; the Gaussians' own for a scene without one."""
         tables = [block.arrays[kind] for name, block in self.blocks.items() if name.endswith(".table")]
-        geometry = self.blocks["geometry"].arrays[kind]
+        geometry, sh = (self.blocks[name].arrays[kind] for name in ("geometry", "sh"))
         if self._weights is None:
-            return FieldArrays(geometry, geometry, [], geometry)
-        return FieldArrays(geometry, self.blocks["beside"].arrays[kind], tables, self.flat_weights(kind))
+            return FieldArrays(geometry, sh, geometry, [], geometry)
+        return FieldArrays(geometry, sh, self.blocks["beside"].arrays[kind], tables, self.flat_weights(kind))
 
     def flat_weights(self, kind: str) -> DeviceArray:
         """The field's weights as one row of numbers."""

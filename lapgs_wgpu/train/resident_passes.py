@@ -7,10 +7,9 @@ from typing import Any
 from torch import Tensor
 
 from lapgs_wgpu.data.views import View
-from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.gpu.kernel import Commands, Kernel, Later, Recording
 from lapgs_wgpu.gpu.matmul import sum_columns
-from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.passes.activation_passes import ActivationPasses, Line
 from lapgs_wgpu.motion.passes.grid_field_passes import Decoding, GridFieldPasses
@@ -183,8 +182,8 @@ class ResidentPasses:
         return lambda: getattr(self._task, name)
 
     def _activate(self, commands: Commands, degree: int, decoding: Decoding | None) -> Gaussians[DeviceArray]:
-        geometry, sh = (self.parameters.blocks[name].arrays["value"] for name in ("geometry", "sh"))
-        return self._activation.activate(commands, geometry, sh, degree, decoding, antialiased=self._scene.antialiased)
+        values, antialiased = self.parameters.arrays("value"), self._scene.antialiased
+        return self._activation.activate(commands, values, degree, decoding, antialiased=antialiased)
 
     def _record_bwd(
         self,
@@ -198,10 +197,9 @@ class ResidentPasses:
         passes, field, smooth = self._activation, self._field, self._config.smoothness
         values, gradients = self.parameters.arrays("value"), self.parameters.arrays("gradient")
         if line is not None:
-            accelerations = passes.acceleration(commands, line, values.geometry, drawn, by_drawn, gradients.geometry)
+            accelerations = passes.acceleration(commands, line, values, drawn, by_drawn, gradients)
             self._total(commands, accelerations, "acceleration", line.scale)
-        d_sh = self.parameters.blocks["sh"].arrays["gradient"]
-        passes.activate_bwd(commands, values.geometry, drawn, by_drawn, decoding, gradients.geometry, d_sh)
+        passes.activate_bwd(commands, values, drawn, by_drawn, decoding, gradients)
         if field is None or decoding is None:
             return
         for each in (decoding, *(() if line is None else (line.before, line.after))):
@@ -256,4 +254,4 @@ class ResidentPasses:
             commands.dispatch(kernel, -(-count // 64), seen=seen, guard=guard, **arrays)
         self.parameters.record_adam(commands, guard, moving=moving)
         geometry = self.parameters.blocks["geometry"].arrays["value"]
-        self.corrections.record_step(commands, guard, drawing.frames[0], geometry)
+        self.corrections.record_step(commands, guard, drawing.arrays["frame"], geometry)

@@ -12,8 +12,7 @@ from helpers.ply_files import columns_of, ply_bytes, random_still
 from helpers.scene_files import scene_of_outliers
 
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.fields.config import FieldConfig, PlaneConfig
-from lapgs_wgpu.motion.fields.hash_grid_config import HashConfig
+from lapgs_wgpu.motion.fields.config import FieldConfig, HashConfig, PlaneConfig
 from lapgs_wgpu.motion.playback.playback import DevicePlayback
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.motion.scene_file import compact_bytes, read_scene

@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
+from lapgs_wgpu.motion.fields.config import TIME
 from lapgs_wgpu.motion.fields.hash_encoder import HashGrid
-from lapgs_wgpu.motion.fields.hash_grid_config import TIME
 
 
 def encode_reference(grid: HashGrid, table: Tensor, points: Tensor, time: float, bound: float) -> Tensor:

@@ -4,10 +4,9 @@ import torch
 from torch import Tensor, nn
 
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.fields.config import FieldConfig, PlaneConfig
+from lapgs_wgpu.motion.fields.config import FieldConfig, HashConfig, PlaneConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation, Field, Nearby
 from lapgs_wgpu.motion.fields.grid_field import GridField
-from lapgs_wgpu.motion.fields.hash_grid_config import HashConfig
 from lapgs_wgpu.motion.scene import make_field
 
 OURS = FieldConfig(

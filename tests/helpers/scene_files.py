@@ -12,8 +12,7 @@ from torch import Tensor
 
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.checkpoint import read_checkpoint, write_checkpoint
-from lapgs_wgpu.motion.fields.config import FieldConfig
-from lapgs_wgpu.motion.fields.hash_grid_config import HashConfig
+from lapgs_wgpu.motion.fields.config import FieldConfig, HashConfig
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.motion.scene_file import SceneFile
 

@@ -7,8 +7,7 @@ import torch
 from torch import Tensor
 
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.fields.config import FieldConfig
-from lapgs_wgpu.motion.fields.hash_grid_config import HashConfig
+from lapgs_wgpu.motion.fields.config import FieldConfig, HashConfig
 from lapgs_wgpu.motion.scene import Scene4D
 
 GRID4D = FieldConfig(

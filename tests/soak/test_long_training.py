@@ -18,8 +18,8 @@ from helpers.training import configure
 from synthetic import write_synthetic
 
 from lapgs_wgpu.data import load_dataset
+from lapgs_wgpu.gpu.array import BufferPool
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.train.host import keep_freed_memory
 from lapgs_wgpu.train.trainer import Trainer
 

@@ -1,4 +1,4 @@
-// The Gaussians of a scene at a time: motion/playback/grid_field_playback.py on the page, and its activations.
+// The Gaussians of a scene at a time: motion/playback/playback.py on the page, and its activations.
 import { Commands, Pool, part } from "./gpu.js";
 import { HashEncoder } from "./hash_encoder.js";
 import { temporalGrids } from "./hash_grid.js";

@@ -1,4 +1,4 @@
-// Shapes of hash grids, as motion/fields/hash_grid_config.py makes them.
+// Shapes of hash grids, as motion/fields/config.py makes them.
 const TIME = 3; // the axis number of time
 const SLICE_CELLS = 1 << 14;
 const TEMPORAL_AXES = [[0, 1, TIME], [1, 2, TIME], [0, 2, TIME]];

@@ -1,21 +1,41 @@
-"""Configuration of deformation fields, and derived sizes."""
+"""Configuration of deformation fields, and the shapes of their hash grids. Without torch."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
 from lapgs_wgpu.io.dataclass_table import Options, option
-from lapgs_wgpu.motion.fields.hash_grid_config import TIME, GridShape, HashConfig
 from lapgs_wgpu.splat.constants import CONSTANTS
 
 Method = Literal["static", "mlp", "hexplane", "grid4d", "laplacian"]
 FieldKind = Literal[Method, "own"]
 MIN_SCALE = CONSTANTS["MIN_SCALE"]
+TIME = 3  # the axis number of time
 TEMPORAL_AXES = ((0, 1, TIME), (1, 2, TIME), (0, 2, TIME))  # of the temporal hash grids
 GEOMETRY = (4, 3, 4, 3)  # outputs of the grid fields' geometry heads: turn, shift, quaternion, scale
+_SLICE_CELLS = 1 << 14  # a level of a hash grid with more cells per plane is not sliced
 _DEVICE_WIDTH = 2048  # largest width of a decoder that kernels evaluate
 # Factor of the appearance head's outputs. The head then learns about as fast as the colors; faster, it would explain
 # motion by changes of color.
 APPEARANCE_SCALE = 0.1
+
+
+@dataclass(frozen=True)
+class HashConfig(Options):
+    """The shape of a hash grid."""
+
+    levels: int = option(
+        "number of resolution levels, which grow geometrically from base to finest", 16, at_least=1, at_most=64
+    )
+    base: tuple[int, int, int] = option(
+        "resolution of the coarsest level along each axis", (16, 16, 16), at_least=2, at_most=1 << 16
+    )
+    finest: tuple[int, int, int] = option(
+        "resolution of the finest level along each axis", (2048, 2048, 2048), at_least=2, at_most=1 << 16
+    )
+    table_log2: int = option(
+        "log2 of the largest number of entries per level; larger levels are hashed", 19, at_least=1, at_most=24
+    )
 
 
 @dataclass(frozen=True)
@@ -123,6 +143,48 @@ class FieldConfig(Options):
     def grid_time(self, t: float) -> float:
         """Return the position on the temporal grids' time axis, in [0, 1], of a time in [0, 1]."""
         return 0.5 * ((2.0 * t - 1.0) * self.time_scale + 1.0)
+
+
+@dataclass(frozen=True)
+class Level:
+    """A level. scale: cells along each axis, a real number. resolution: entries along each axis. first: first entry."""
+
+    scale: tuple[float, float, float]
+    resolution: tuple[int, int, int]
+    entries: int
+    first: int
+
+    @property
+    def dense(self) -> bool:
+        return math.prod(self.resolution) <= self.entries
+
+
+class GridShape:
+    """A multi-resolution hash grid without its table (Instant-NGP, with the resolutions of Grid4D; paper eq. 1).
+
+    axes: three of x, y, z (0 to 2) and t (3, only as the last one). entries: rows of the table, which hold two features
+    each. features: length of a point's encoding.
+    """
+
+    def __init__(self, config: HashConfig, axes: tuple[int, int, int]) -> None:
+        self.axes, self.features = axes, 2 * config.levels
+        self.levels: list[Level] = []
+        self.entries = 0
+        for number in range(config.levels):  # the resolution grows geometrically along each axis
+            share = number / max(1, config.levels - 1)
+            x, y, z = (a * (b / a) ** share for a, b in zip(config.base, config.finest, strict=True))
+            resolution = math.ceil(x - 1e-9), math.ceil(y - 1e-9), math.ceil(z - 1e-9)
+            entries = min(1 << config.table_log2, math.prod(resolution))
+            self.levels.append(Level((x - 1, y - 1, z - 1), resolution, entries, self.entries))
+            self.entries += entries
+
+    @property
+    def sliced(self) -> list[int]:
+        """Levels that are sliced at the time of the points before the lookup."""
+        if self.axes[2] != TIME:
+            return []
+        cells = [level.resolution[0] * level.resolution[1] for level in self.levels]
+        return [i for i, level in enumerate(self.levels) if level.dense and cells[i] <= _SLICE_CELLS]
 
 
 def static_grid(config: FieldConfig) -> GridShape:

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.fields.config import GEOMETRY, TEMPORAL_AXES, FieldConfig
+from lapgs_wgpu.motion.fields.config import GEOMETRY, FieldConfig, temporal_grids
 from lapgs_wgpu.motion.fields.deformation import Deformation, Field, Nearby, TimeSamples, linear
 from lapgs_wgpu.motion.fields.hash_encoder import HashEncoder, HashGrid
 from lapgs_wgpu.motion.fields.laplacian import LaplacianMotion, TimeMotion
@@ -31,10 +31,10 @@ class GridField(Field):
             return linear(shapes[f"{name}.weight"], generator)
 
         self.static_grid = HashGrid(config.static, (0, 1, 2), generator)
-        axes = TEMPORAL_AXES if config.temporal_hash else ()
-        self.temporal_grids = nn.ModuleList(HashGrid(config.temporal, three, generator) for three in axes)
-        groups = [[self.static_grid], self.grids[1:]] if axes else [[self.static_grid]]
-        self._encoder = HashEncoder(device, groups, config.bound)
+        temporal = [HashGrid(config.temporal, grid.axes, generator) for grid in temporal_grids(config)]
+        self.temporal_grids = nn.ModuleList(temporal)
+        self.grids = [self.static_grid, *temporal]
+        self._encoder = HashEncoder(device, [[self.static_grid], temporal], config.bound)
         self.spatial = layer("spatial")
         self.temporal = layer("temporal")
         hidden = [(layer(f"hidden.{2 * i}"), nn.ReLU()) for i in range(config.depth)]
@@ -45,11 +45,6 @@ class GridField(Field):
             kind = LaplacianMotion if config.motion == "laplacian" else TimeMotion
             self.motion = kind(self.static_grid.features, config, generator)
         self.appearance = linear(shapes["appearance.weight"]) if config.appearance_size else None
-
-    @property
-    def grids(self) -> list[HashGrid]:
-        """All hash grids, the spatial one first."""
-        return [self.static_grid, *(grid for grid in self.temporal_grids if isinstance(grid, HashGrid))]
 
     def forward(
         self, means: Tensor, t: float, dynamics: Tensor | None = None, nearby: Nearby | None = None
@@ -84,11 +79,10 @@ class GridField(Field):
         d_dc, d_opacity = look[:, :3] if size else None, look[:, 3] if size == 4 else None
         return Deformation(rotation, shift, d_quats, d_scales, d_dc, d_opacity)
 
-    def _decode(self, t: float, dynamics: Tensor | None, static: Tensor, temporal: Tensor | None = None) -> Tensor:
+    def _decode(self, t: float, dynamics: Tensor | None, static: Tensor, temporal: Tensor) -> Tensor:
         """Return the outputs of the geometry heads (N, 14) and, in further columns, of the appearance head."""
-        count, size = len(static), self.config.dynamics_size
-        temporal = static.new_zeros(count, 0) if temporal is None else temporal
-        dynamics = dynamics if size and dynamics is not None else static.new_zeros(count, size)
+        size = self.config.dynamics_size
+        dynamics = dynamics if size and dynamics is not None else static.new_zeros(len(static), size)
         outputs = decode(static, temporal, dynamics, self._weights(t))
         if not len(self.hidden):
             return outputs
@@ -142,5 +136,5 @@ class GridField(Field):
 def _smoothness(here: list[Tensor], near: list[Tensor], nearby: Nearby) -> Tensor:
     """Grid4D's smoothness loss: the mean squared distance between the features of near places, static and temporal."""
     sq_distances = torch.stack([(b - a[nearby.rows]).square().sum() for a, b in zip(here, near, strict=True)])
-    weights = sq_distances.new_tensor([nearby.static_weight, nearby.temporal_weight][: len(sq_distances)])
+    weights = sq_distances.new_tensor([nearby.static_weight, nearby.temporal_weight])
     return (weights * sq_distances).sum() / max(1, len(nearby.rows))

@@ -8,11 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lapgs_wgpu.gpu.array import DeviceArray, read_all
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray, read_all
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
-from lapgs_wgpu.gpu.pool import BufferPool
-from lapgs_wgpu.motion.fields.hash_grid_config import GridShape, HashConfig
+from lapgs_wgpu.motion.fields.config import GridShape, HashConfig
 from lapgs_wgpu.motion.passes.hash_encoder_passes import HashEncoderPasses, PointSet
 
 Place = tuple[Tensor, float]  # points (N, 3), world units, and a time in [0, 1]

@@ -5,9 +5,8 @@ import math
 import torch
 from torch import Tensor, nn
 
-from lapgs_wgpu.motion.fields.config import FieldConfig
+from lapgs_wgpu.motion.fields.config import TIME, FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation, Field, Nearby, linear
-from lapgs_wgpu.motion.fields.hash_grid_config import TIME
 from lapgs_wgpu.motion.fields.parameter_shapes import HEXPLANE_HEADS, PLANES, parameter_shapes
 
 # Weights of the smoothness loss that 4D-GS trains with on D-NeRF scenes.

@@ -1,7 +1,6 @@
 """Names and shapes of the parameters of fields, in the order of the module's state_dict. Without torch."""
 
-from lapgs_wgpu.motion.fields.config import GEOMETRY, FieldConfig, static_grid, temporal_grids
-from lapgs_wgpu.motion.fields.hash_grid_config import TIME
+from lapgs_wgpu.motion.fields.config import GEOMETRY, TIME, FieldConfig, static_grid, temporal_grids
 
 PLANES = ((0, 1), (0, 2), (1, 2), (0, TIME), (1, TIME), (2, TIME))  # of the field hexplane: pairs of x, y, z, t
 HEXPLANE_HEADS = (3, 4, 3)  # outputs of the field hexplane's heads: shift, quaternion, scale

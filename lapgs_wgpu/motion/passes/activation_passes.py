@@ -2,12 +2,11 @@
 
 from typing import NamedTuple
 
-from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.motion.fields.config import GEOMETRY, FieldConfig
-from lapgs_wgpu.motion.passes.grid_field_passes import Decoding
+from lapgs_wgpu.motion.passes.grid_field_passes import Decoding, FieldArrays
 from lapgs_wgpu.motion.passes.samples import SamplePasses
 from lapgs_wgpu.splat.drawing import GaussianGradients
 from lapgs_wgpu.splat.gaussians import Gaussians
@@ -29,8 +28,7 @@ class Line(NamedTuple):
 
 
 class ActivationPasses:
-    """Records the passes on one device. geometry: (N, 12) and sh (N, 48), as they are trained, see
-    common/geometry.wgsl."""
+    """Records the passes on one device. values, gradients: of the Gaussians as they are trained."""
 
     def __init__(self, device: Device, config: FieldConfig) -> None:
         self._device, self._config = device, config
@@ -40,52 +38,44 @@ class ActivationPasses:
         self._mirror = float(config.negative_scales == "mirror")
 
     def activate(
-        self,
-        commands: Commands,
-        geometry: DeviceArray,
-        sh: DeviceArray,
-        degree: int,
-        decoding: Decoding | None,
-        *,
-        antialiased: bool,
+        self, commands: Commands, values: FieldArrays, degree: int, decoding: Decoding | None, *, antialiased: bool
     ) -> Gaussians[DeviceArray]:
         """Record the activation of Gaussians; without a decoding they stand still.
 
         degree: of the harmonics that are drawn.
         """
-        n = geometry.shape[0]
+        n = values.geometry.shape[0]
         shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
         drawn = {name: self._pool.array(name, shape) for name, shape in shapes.items()}
         colors = self._pool.array("sh", (n, (degree + 1) ** 2, 3))
-        arrays = drawn | {"geometry": geometry, "sh": sh, "colors": colors}
+        arrays = drawn | {"geometry": values.geometry, "sh": values.sh, "colors": colors}
         self._run(commands, decoding, arrays, back=False)
         return Gaussians(**drawn, sh=colors, antialiased=antialiased)
 
     def activate_bwd(
         self,
         commands: Commands,
-        geometry: DeviceArray,
+        values: FieldArrays,
         drawn: Gaussians[DeviceArray],
         by_drawn: GaussianGradients,
         decoding: Decoding | None,
-        d_geometry: DeviceArray,
-        d_sh: DeviceArray,
+        gradients: FieldArrays,
     ) -> None:
-        """Record the gradients: d_geometry is added to, d_sh written, and the decoding's outputs become theirs."""
+        """Record the gradients: of geometry is added to, of sh written, and the decoding's outputs become theirs."""
         assert by_drawn.sh is not None
-        arrays = {"geometry": geometry, "opacities": drawn.opacities, "d_geometry": d_geometry}
+        arrays = {"geometry": values.geometry, "opacities": drawn.opacities, "d_geometry": gradients.geometry}
         arrays |= {"d_splats": by_drawn.splats, "d_means": by_drawn.means, "d_quats": by_drawn.quats}
-        arrays |= {"d_scales": by_drawn.scales, "sh": d_sh, "colors": by_drawn.sh}
+        arrays |= {"d_scales": by_drawn.scales, "sh": gradients.sh, "colors": by_drawn.sh}
         self._run(commands, decoding, arrays, back=True)
 
     def acceleration(
         self,
         commands: Commands,
         line: Line,
-        geometry: DeviceArray,
+        values: FieldArrays,
         drawn: Gaussians[DeviceArray],
         by_drawn: GaussianGradients,
-        d_geometry: DeviceArray,
+        gradients: FieldArrays,
     ) -> DeviceArray:
         """Record the acceleration loss of each sample, without its weight: (count,).
 
@@ -98,8 +88,8 @@ class ActivationPasses:
             share = (now.time() - before.time()) / (after.time() - before.time())
             return kernel.uniform("Acceleration", outputs=self._outputs, mirror=self._mirror, share=share, scale=scale)
 
-        values = self._pool.array("accelerations", (before.points.count,))
-        arrays = {"geometry": geometry, "d_geometry": d_geometry, "values": values}
+        losses = self._pool.array("accelerations", (before.points.count,))
+        arrays = {"geometry": values.geometry, "d_geometry": gradients.geometry, "values": losses}
         arrays |= {"means": drawn.means, "scales": drawn.scales, "before": before.outputs, "after": after.outputs}
         arrays |= {"d_means": by_drawn.means, "d_scales": by_drawn.scales}
         arrays |= {"biases_before": before.biases, "biases_after": after.biases}
@@ -107,7 +97,7 @@ class ActivationPasses:
         arrays["acceleration"] = self._pool.varying("acceleration", write)
         for name in ("acceleration", "acceleration_bwd"):
             commands.run(Kernel.get(self._device, name), -(-before.points.count // 64), arrays)
-        return values
+        return losses
 
     def _run(
         self, commands: Commands, decoding: Decoding | None, arrays: dict[str, DeviceArray], *, back: bool

@@ -12,11 +12,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.gpu.matmul import Matmul, Matrix
-from lapgs_wgpu.gpu.pool import BufferPool
+from lapgs_wgpu.gpu.matmul import Matrix, multiply, multiply_long
 from lapgs_wgpu.motion.fields.config import APPEARANCE_SCALE, GEOMETRY, FieldConfig, static_grid, temporal_grids
 from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
 from lapgs_wgpu.motion.passes.hash_encoder_passes import HashEncoderPasses, PointSet
@@ -33,14 +32,15 @@ Time = Callable[[], float]  # gives that of the step that is taken, in [0, 1]
 
 
 class FieldArrays(NamedTuple):
-    """What a field computes with, or the gradients of it.
+    """Gaussians and the field that moves them, or the gradients of both.
 
-    geometry: (N, 12), as common/geometry.wgsl has it; its gradient is not the field's. beside: (N, D + 1) dynamics
-    attributes, then ones. tables: (entries, 2) of each grid, the spatial one first. weights: the parameters of
+    geometry: (N, 12), as common/geometry.wgsl has it; its gradient is not the field's. sh: (N, 48). beside: (N, D + 1)
+    dynamics attributes, then ones. tables: (entries, 2) of each grid, the spatial one first. weights: the parameters of
     `GridFieldPasses.places`.
     """
 
     geometry: DeviceArray
+    sh: DeviceArray
     beside: DeviceArray
     tables: list[DeviceArray]
     weights: DeviceArray
@@ -51,8 +51,8 @@ class Decoding(NamedTuple):
 
     time: gives that of the field, in [0, 1]. sampling: gives those of the Gaussians; None for all, in their order.
     points: of the encoder. inputs: of the decoder, by name: beside (count, D + 1) dynamics attributes, then ones;
-    static and temporal (count, features), the latter where there is any; in the backward pass these two become their
-    gradients. heads: (outputs, features) weights at that time, of what the gate leaves and of the motion's inner layer.
+    static and temporal (count, features); in the backward pass these two become their gradients. heads: (outputs,
+    features) weights at that time, of what the gate leaves and of the motion's inner layer.
     biases: (20,) of the heads, of which as many count as there are outputs. outputs: (count, outputs) of the heads,
     without their biases; before the backward pass they become their gradient.
     """
@@ -76,10 +76,10 @@ class GridFieldPasses:
     def __init__(self, device: Device, config: FieldConfig) -> None:
         self.config, self._device, self._pool = config, device, BufferPool(device)
         self._samples = SamplePasses(device, self._pool)
-        self._encoders = [HashEncoderPasses(device, [static_grid(config)], config.bound)]
-        if temporal := temporal_grids(config):
-            self._encoders.append(HashEncoderPasses(device, temporal, config.bound, first_table=1))
-        self._product = Matmul(device, self._pool)
+        grids = [static_grid(config)], temporal_grids(config)
+        self._encoders = [
+            HashEncoderPasses(device, group, config.bound, first_table=i) for i, group in enumerate(grids)
+        ]
         self.dynamics, self._outputs = config.dynamics_size, sum(GEOMETRY) + config.appearance_size
         self._motion, width = config.kind == "laplacian", config.width
         # Channels of all layers: spatial, the motion's inner ones, temporal. The heads read as many as there are placed
@@ -94,7 +94,7 @@ class GridFieldPasses:
             self.places[name] = self.count
             self.count += math.prod(shapes[name])
         self._block = max(64, min(_BLOCK, device.max_binding // (4 * self._channels) // 64 * 64))
-        static, moving = static_grid(config).features, sum(grid.features for grid in temporal_grids(config))
+        static, moving = (encoder.features for encoder in self._encoders)
         first, row, size = self.places["temporal.weight"], shapes["temporal.weight"][1], self.dynamics
         # What is added to the layers: the first columns of an input, from a channel on, times a matrix of the weights
         # (channels, columns); of it also the stride and the first number.
@@ -118,7 +118,7 @@ class GridFieldPasses:
         if sampling is not None:
             beside = self._pool.array(f"beside {number}", (points.count, beside.shape[1]))
             self._samples.rows(commands, f"set {number}", sampling, arrays.beside, beside, back=False)
-        inputs = dict(zip(("beside", "static", "temporal"), [beside, *encodings], strict=False))
+        inputs = dict(zip(("beside", "static", "temporal"), [beside, *encodings], strict=True))
         heads = self._pool.array(f"heads {number}", (self._outputs, self._placed))
         biases = self._pool.array(f"biases {number}", (_BIASES,))
         bound = self._bound(arrays.weights, t, number) | {"heads": heads, "biases": biases}
@@ -129,7 +129,7 @@ class GridFieldPasses:
         outputs = self._pool.array(f"outputs {number}", (points.count, self._outputs))
         for first, count in self._blocks(points):
             _, features = self._activate(commands, first, count, inputs, arrays.weights)
-            self._product(commands, features, Matrix.of(heads).transpose, Matrix.of(outputs.rows(first, count)))
+            multiply(commands, self._pool, features, Matrix.of(heads).transpose, Matrix.of(outputs.rows(first, count)))
         return Decoding(t, sampling, points, inputs, heads, biases, outputs)
 
     def decode_bwd(self, commands: Commands, decoding: Decoding, arrays: FieldArrays, gradients: FieldArrays) -> None:
@@ -140,7 +140,7 @@ class GridFieldPasses:
         d_beside = gradients.beside
         if decoding.sampling is not None:
             d_beside = self._pool.array("d_beside", decoding.inputs["beside"].shape)
-        inputs, d_inputs, split = decoding.inputs, decoding.inputs | {"beside": d_beside}, self._product.split_k
+        inputs, d_inputs = decoding.inputs, decoding.inputs | {"beside": d_beside}
         weights, d_weights, number = arrays.weights, gradients.weights, decoding.points.number
         d_heads = self._pool.array("d_heads", decoding.heads.shape)
         d_biases = self._pool.array("d_biases", (_BIASES,))
@@ -149,16 +149,16 @@ class GridFieldPasses:
             layers, features = self._activate(commands, first, count, inputs, weights)
             d, more = Matrix.of(decoding.outputs.rows(first, count)), first > 0
             ones = Matrix.of(inputs["beside"].rows(first, count)).from_column(self.dynamics, 1)
-            split(commands, d.transpose, features, Matrix.of(d_heads), add=more)
-            split(commands, d.transpose, ones, Matrix(d_biases, self._outputs, 1, 1), add=more)
-            self._product(commands, d, Matrix.of(decoding.heads), features)
+            multiply_long(commands, self._pool, d.transpose, features, Matrix.of(d_heads), add=more)
+            multiply_long(commands, self._pool, d.transpose, ones, Matrix(d_biases, self._outputs, 1, 1), add=more)
+            multiply(commands, self._pool, d, Matrix.of(decoding.heads), features)
             self._gate("gate_bwd", commands, count, weights, d_features=features.array, layers=layers.array)
-            split(commands, layers.transpose, ones, of_layers, add=True)
+            multiply_long(commands, self._pool, layers.transpose, ones, of_layers, add=True)
             for name, channel, place in self._products:
                 own, matrix = layers.from_column(channel, place[0]), Matrix(weights, *place)
                 given, d_given = (_columns(each[name], first, count, matrix) for each in (inputs, d_inputs))
-                split(commands, own.transpose, given, Matrix(d_weights, *place), add=True)
-                self._product(commands, own, matrix, d_given)
+                multiply_long(commands, self._pool, own.transpose, given, Matrix(d_weights, *place), add=True)
+                multiply(commands, self._pool, own, matrix, d_given)
         bound = self._bound(weights, decoding.time, number) | {"d_weights": d_weights}
         bound |= {"d_series": self._pool.array("d_series", (self.config.width,))}
         bound |= {"d_heads": d_heads, "d_biases": d_biases}
@@ -189,7 +189,7 @@ class GridFieldPasses:
         here, there = (self._encode(commands, points, arrays.tables) for points in (means, places))
         forth, back = Kernel.get(self._device, "smoothness"), Kernel.get(self._device, "smoothness_bwd")
         sums = []
-        for group, (a, b, weight) in enumerate(zip(here, there, weights, strict=False)):
+        for group, (a, b, weight) in enumerate(zip(here, there, weights, strict=True)):
             (count, features), total = a.shape, self._pool.array(f"differences {group}", (means.count,))
             content = forth.uniform("Smoothness", pairs=count, features=features, scale=2 * weight)
             both = {"smoothness": self._pool.constant(content), "here": a, "there": b}
@@ -248,7 +248,7 @@ class GridFieldPasses:
         for name, channel, place in self._products:
             own, matrix = layers.from_column(channel, place[0]), Matrix(weights, *place)
             given, more = _columns(inputs[name], first, count, matrix), name == "temporal" and self.dynamics > 0
-            self._product(commands, given, matrix.transpose, own, add=more)
+            multiply(commands, self._pool, given, matrix.transpose, own, add=more)
         self._gate("gate", commands, count, weights, layers=layers.array, features=features.array)
         return layers, features
 

@@ -11,11 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.gpu.device import SOFTWARE_LOOP_TURNS, Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.gpu.pool import BufferPool
-from lapgs_wgpu.motion.fields.hash_grid_config import GridShape
+from lapgs_wgpu.motion.fields.config import GridShape
 
 _ALIGNED = 64  # rows; a multiple of 256 bytes for every row size, at which a binding may begin
 _LEVEL_WORDS = 16  # common/hashgrid.wgsl: struct Level
@@ -146,7 +145,12 @@ class HashEncoderPasses:
         if not self._lane_levels:
             named = enumerate(floats)
             sums = [(of, self._pool.array(f"d_fixed {i}", (2 * d.size,), "uint32")) for i, (of, d) in named]
-            of_all["largest"] = self._largest(commands, points, d_encoding)
+            largest = of_all["largest"] = self._pool.array(f"largest {points.number}", (1,), "uint32")
+            commands.clear(largest)
+            for first, count, grid in blocks:  # the largest absolute value, which scales fixed-point sums
+                arrays = {"grid": grid, "d_encoding": d_encoding.rows(first, count), "largest": largest}
+                kernel = Kernel.get(self._device, "hashgrid_largest")
+                commands.dispatch(kernel, -(-count * self._row // 4096), **arrays)
         for first, count, grid in blocks:
             arrays = {"points": points.array.rows(first, count), "d_encoding": d_encoding.rows(first, count)}
             for levels, target in sums:
@@ -165,16 +169,6 @@ class HashEncoderPasses:
             kernel = Kernel.get(self._device, "hashgrid_slice_bwd", LONG_LANES=self._lane_levels)
             arrays = {"levels": cut.array, "d_slices": d_slices, "d_features": d_tables[number], "grid": blocks[0][2]}
             commands.dispatch_grid(kernel, (-(-cut.cells // self._group_cells), cut.count), **arrays)
-
-    def _largest(self, commands: Commands, points: PointSet, d_encoding: DeviceArray) -> DeviceArray:
-        """Return the largest absolute value of a gradient, which scales fixed-point sums."""
-        largest = self._pool.array(f"largest {points.number}", (1,), "uint32")
-        commands.clear(largest)
-        kernel = Kernel.get(self._device, "hashgrid_largest")
-        for first, count, grid in self._blocks(points):
-            gradient = d_encoding.rows(first, count)
-            commands.dispatch(kernel, -(-count * self._row // 4096), grid=grid, d_encoding=gradient, largest=largest)
-        return largest
 
 
 def _level_words(grid: GridShape, first_number: int, first_sliced: int) -> NDArray[np.uint32]:

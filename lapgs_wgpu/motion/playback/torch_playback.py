@@ -1,10 +1,11 @@
 """Playback of scenes that torch evaluates: other fields, and scenes in training."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
-from lapgs_wgpu.gpu.array import DeviceArray
-from lapgs_wgpu.gpu.pool import BufferPool
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.io.ply import GaussianSnapshot
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.gaussians import Gaussians
@@ -22,10 +23,8 @@ class TorchPlayback:
         self.scene = scene
         self.device, self.metadata = scene.device, scene.metadata
         self._pool = BufferPool(scene.device)  # a training uses its own
-        self._shown: Gaussians[DeviceArray] | None = None
-        # Time and degree of what is shown, and id and version of each parameter.
-        self._shown_of: tuple[float, int, list[tuple[int, int]]] | None = None
-        self._parameters: list[Tensor] = []  # kept, so that no other tensor has their ids
+        # What it is of: time, degree, ids and versions of parameters; these, so that no other tensor has their ids; it.
+        self._shown: tuple[tuple[Any, ...], list[Tensor], Gaussians[DeviceArray]] | None = None
 
     @property
     def count(self) -> int:
@@ -41,13 +40,11 @@ class TorchPlayback:
         if scene.field is not None:
             parameters += scene.field.parameters()
         wanted = t, scene.sh_degree, [(id(parameter), parameter._version) for parameter in parameters]
-        if self._shown is None or self._shown_of != wanted:
+        if self._shown is None or self._shown[0] != wanted:
             self._shown = None  # after a failure the buffers would be inconsistent
             with torch.no_grad():
-                now = scene.at(t)
-            self._shown = upload_gaussians(self._pool, now)
-            self._shown_of, self._parameters = wanted, parameters
-        return self._shown
+                self._shown = wanted, parameters, upload_gaussians(self._pool, scene.at(t))
+        return self._shown[-1]
 
     def snapshot(self, t: float) -> GaussianSnapshot:
         return self.scene.snapshot(t)
