@@ -6,7 +6,7 @@ there outwards, each time turns as its image fits best what is known of the ball
 then each is fitted once more to what all others show. `rigid_fit` makes it exact.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,17 +21,13 @@ from lapgs_wgpu.discovery.tracks import Tracks, parabolas
 
 Doubles = NDArray[np.float64]
 
-PIXELS = 2000  # of an image, at most
-SAMPLES = 150  # of a part in an image, at most
-LEAST_SAMPLES = 10
-LEAST_TIMES = 12  # at which a part is seen
+PIXELS, SAMPLES = 2000, 150  # of an image, and of a part in it, at most
+LEAST_SAMPLES, LEAST_TIMES = 10, 12  # of a part in an image, and at which it is seen
 ROUND = 0.9  # quantile of the distances of a part's points from its center that is the radius of the ball
 RIM = 0.9  # radii of the ball; beyond, pixels are mixed with what lies behind
 INSIDE = 0.75  # radii of the larger of two parts, within which the center of the other is of the same thing
 OVERLAP = 1.2  # radii of a part, within which pixels may show it
-OUTLINES = 2  # rounds in which balls are brought to the outlines of what moves
 UNSEEN = 1e-3  # weight of a time that shows no outline
-OUTLINE_SPREAD = 2.0  # time steps; of the weights by which these moves become smooth
 DARK = 0.2  # least light, of the mean brightness
 KEYS = 3  # times around which the turn is looked for
 WINDOW = 8.0  # time steps on either side
@@ -46,7 +42,7 @@ KEPT = 5  # time steps from the key time, up to which its turn is kept
 AROUND = (6.0, 2), (2.0, 2), (1.0, 1)  # degrees of a step and number of steps, of the search for the turn of a time
 AS_BEFORE = 36.0  # degrees beside the turn that goes on as before, that weigh as much as all differences of color
 MEMORY = 4  # times by which a turn goes on
-SPREAD = 6.0  # time steps; of the weights by which turns become smooth
+SPREAD, OUTLINE_SPREAD = 6.0, 2.0  # time steps; of the weights by which turns, and balls' moves, become smooth
 # Share of the colors' variance that is left without turns, which the turns of a part must explain: true ones 0.28 and
 # more, others 0.17 at most.
 GAIN = 0.22
@@ -57,6 +53,10 @@ class _Look(NamedTuple):
 
     places: Doubles
     colors: Floats
+
+
+def _joined(looks: Iterable[_Look]) -> _Look:
+    return _Look(*map(np.concatenate, zip(*looks, strict=True)))
 
 
 def harmonics(x: Any, y: Any, z: Any) -> list[Any]:
@@ -80,7 +80,7 @@ def find_turns(
     stands = _one_of_each(centers, radii)
     things = np.unique(stands)
     middles, sizes = np.stack([centers[k] for k in things], axis=1), radii[things]
-    for _ in range(OUTLINES):
+    for _ in range(2):
         middles, sizes = _outlined(times, middles, sizes, images)
     clock, near = times / time_step(times), parabolas(times, 1.0, SPREAD)
     found = {}
@@ -88,11 +88,12 @@ def find_turns(
         looks = _looks(n, times, middles, sizes, images)
         if sum(len(look.places) > 0 for look in looks) < LEAST_TIMES:
             continue
+        looks = _unlit(looks)
         R = _smoothed(_turns(looks, clock), clock, near)
         known = sum(map(_known, looks, R), np.zeros(()))
         again = [_turn_of(look, each, known - _known(look, each)) for look, each in zip(looks, R, strict=True)]
         R = _smoothed(np.stack(again), clock, near)
-        places, colors = (np.concatenate(each) for each in zip(*looks, strict=True))
+        places, colors = _joined(looks)
         still = _explained(places, colors)
         turned = np.concatenate([look.places @ each for look, each in zip(looks, R, strict=True)])
         if _explained(turned, colors) - still >= GAIN * (1.0 - still):
@@ -158,20 +159,18 @@ def _looks(k: int, times: Doubles, centers: Floats, radii: Doubles, images: Sequ
         chosen = chosen[evenly_indices(len(chosen), SAMPLES)]
         distances = along[chosen, k] - np.sqrt(radii[k] ** 2 - np.maximum(beside[chosen, k], 0.0))
         found[at].append(_Look((distances[:, None] * d[chosen] - to[k]) / radii[k], colors[chosen]))
-    return _unlit([_Look(*map(np.concatenate, zip(*each, strict=True))) for each in found])
+    return [_joined(each) for each in found]
 
 
 def _unlit(looks: list[_Look]) -> list[_Look]:
     """The colors without the light, which does not turn with a part."""
-    places, colors = (np.concatenate(each) for each in zip(*looks, strict=True))
+    places, colors = _joined(looks)
     basis, bright = np.stack(harmonics(*places.T), axis=1), colors.mean(axis=1)
     H = basis.T @ basis
     light = np.linalg.solve(H + 1e-3 * (np.trace(H) + 1) / 9 * np.eye(9), basis.T @ bright)
-    least = DARK * float(bright.mean()) if len(bright) else 1.0
-    return [
-        look._replace(colors=look.colors / np.maximum(np.stack(harmonics(*look.places.T), 1) @ light, least)[:, None])
-        for look in looks
-    ]
+    least = DARK * float(bright.mean())
+    lit = (np.maximum(np.stack(harmonics(*look.places.T), 1) @ light, least)[:, None] for look in looks)
+    return [look._replace(colors=look.colors / each) for look, each in zip(looks, lit, strict=True)]
 
 
 def _cells(places: Doubles, size: float) -> NDArray[np.int64]:
@@ -183,8 +182,6 @@ def _cells(places: Doubles, size: float) -> NDArray[np.int64]:
 def _explained(places: Doubles, colors: Floats, blocks: NDArray[np.int64] | int = 0) -> float:
     """Share of the variance of colors (n, 3) that places (n, 3) of size CELL explain, as if they were independent.
     blocks: (n,) from 0; only places of one block are compared."""
-    if len(colors) < 2:
-        return 0.0
     cells = _cells(places, CELL) + blocks * SIDE**3
     counts = np.bincount(cells)
     used = np.flatnonzero(counts)
@@ -199,7 +196,7 @@ def _turn_at(looks: list[_Look], clock: Doubles, key: int) -> tuple[Doubles, flo
     no turn. clock: (T,) time steps."""
     window = [i for i in np.flatnonzero(np.abs(clock - clock[key]) <= WINDOW) if len(looks[i].places)]
     lapses = clock[window] - clock[key]
-    places, colors = (np.concatenate([looks[i][n] for i in window]) for n in (0, 1))
+    places, colors = _joined(looks[i] for i in window)
     of = np.repeat(np.arange(len(window)), [len(looks[i].places) for i in window])
 
     def explained(turns: Doubles, reach: int) -> Doubles:
@@ -251,7 +248,7 @@ def _known(look: _Look, R: Doubles) -> Doubles:
 
 def _turn_of(look: _Look, expected: Doubles, sums: Doubles) -> Doubles:
     """The rotation (3, 3) near the expected one by which a time fits best what others show, as `_known` gives it."""
-    if not len(look.places) or not sums[0].any():
+    if not len(look.places):
         return expected
     total, mean = sums[0].sum(), sums[1:].sum(axis=(1, 2, 3)) / sums[0].sum()
     count, *blurred = (gaussian_filter(each, BLUR, mode="constant", truncate=2.5).ravel() for each in sums)
