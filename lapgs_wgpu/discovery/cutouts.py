@@ -22,17 +22,13 @@ MOST = 24  # cut-outs
 LEAST = 4e-3  # share of an image that a cut-out covers, at least
 ENOUGH = 0.15  # share of an image's moving pixels that may stay unexplained
 BLURS = 4.0, 2.0, 1.0  # pixels; of the images that are compared, one after another
-ITERATIONS = 8  # of each
-PIXELS = 1500  # of a cut-out that are compared, at most
 NEWS = 0.5  # share of what a cut-out explains in an image that none of a nearer image does, at least
 POINTS = 12_000  # of all cut-outs, at most
 ALIKE = 0.12  # difference of two blurred colors that look alike
-LOST = 0.5  # share of a cut-out that must look alike
-VISIBLE = 0.3  # share of a cut-out that must lie in the image
+LOST, VISIBLE = 0.5, 0.3  # shares of a cut-out that must look alike, and lie in the image
 STIFF = 0.02  # weight of the affine part of a map against that before
 FOOT = 0.15  # of its height: the lowest part of a cut-out, which stands on the ground
-HIDDEN = 0.1  # quantile of the depths of what a cut-out hides, which lie behind it
-BEFORE = 0.9  # of the depth of the ground, and of that
+HIDDEN, BEFORE = 0.1, 0.9  # quantile of the depths of what a cut-out hides; how far before that and the ground it is
 APART = -0.5, 0.5  # half sides of the box: how far the first and the last cut-out are moved away from the cameras
 FAR_BELOW = 3  # pixels; the ground that a foot stands on lies so far below
 
@@ -158,7 +154,7 @@ def _followed(levels: Sequence[list[Floats]], masks: Mask, key: int, pixels: NDA
 
 def _registered(source: list[Floats], target: list[Floats], pixels: NDArray[np.int64], M: Map) -> tuple[Map, float]:
     """The map (2, 3) of a cut-out's pixels to another image, near M, and the share of them that look alike there."""
-    chosen = pixels[evenly_indices(len(pixels), PIXELS)]
+    chosen = pixels[evenly_indices(len(pixels), 1500)]
     x, y = chosen.T
     middle = chosen.mean(axis=0)
     scale = max(float(chosen.std()), 1.0)
@@ -166,7 +162,7 @@ def _registered(source: list[Floats], target: list[Floats], pixels: NDArray[np.i
     height, width = source[0].shape[:2]
     for there, here in zip(target, source, strict=True):
         wanted = here[y, x, :4]
-        for _ in range(ITERATIONS):
+        for _ in range(8):
             at = M[:, :2] @ chosen.T + M[:, 2:]
             inside = (at >= 0).all(axis=0) & (at[0] <= width - 1) & (at[1] <= height - 1)
             sampled = _sampled(there, at)

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from lapgs_wgpu.discovery.residual import Floats, Residual
 from lapgs_wgpu.discovery.tracks import Tracks, all_of, parabolas
-from lapgs_wgpu.discovery.turns import harmonics, part_radius
+from lapgs_wgpu.discovery.turns import harmonics
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.linear_light import directions
 from lapgs_wgpu.splat.rasterize import rasterize
@@ -44,7 +44,7 @@ def rigid_tracks(
     Other parts are drawn, too, as they are, and so stay those of which too little of the images is explained.
     """
     parts = list(rotations)
-    radii = torch.tensor([part_radius(tracks, k) for k in parts])
+    radii = torch.tensor([tracks.radius(k) for k in parts])
     others = ~np.isin(stands[tracks.part], parts)
     R0 = torch.from_numpy(np.stack([rotations[k] for k in parts], axis=1)).float()
     centers = torch.from_numpy(np.stack([tracks.center(k) for k in parts], axis=1))

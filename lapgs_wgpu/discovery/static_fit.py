@@ -32,7 +32,7 @@ SCHEDULE = {
     "density.reset_interval": 1.0,
 }
 REFINE = 0.125  # from when on cameras move, at the latest
-# The learning rates are those of 3DGS; of the losses, L1 and SSIM are left.
+# The learning rates are those of 3DGS; of the losses, L1 and SSIM are left: a warm-up, which it all is, has no others.
 VALUES = {
     "field.kind": "static",
     "rates.log_scales": 5e-3,
@@ -42,11 +42,7 @@ VALUES = {
     "density.gradient": 5e-4,
     "density.split": "plain",
     "loss.pyramid": 0.0,
-    "loss.ncc": 0.0,
-    "loss.dynamics": 0.0,
     "schedule.cool_down": 0.0,
-    "smoothness.share": 0.0,
-    "acceleration.weight": 0.0,
     "step_place": "auto",
 }
 

@@ -112,15 +112,17 @@ def surface_points(images: Sequence[Residual], half_side: float) -> PointClouds:
         nearest = [n for n in np.argsort(lapses, kind="stable") if n != i][:NEIGHBORS]
         neighbors = [(images[n], float(lapses[n])) for n in nearest]
         found[np.searchsorted(times, image.time)].append(_points(image, neighbors, always, half_side))
-    return PointClouds(times, tuple(_dense(merged(each), half_side) for each in found), half_side)
+    clouds = [merged(each) for each in found]
+    fourth = [cKDTree(cloud.positions).query(cloud.positions, k=5)[0][:, 4] for cloud in clouds]
+    near = [cloud.chosen(away < LONELY * half_side) for cloud, away in zip(clouds, fourth, strict=True)]
+    return PointClouds(times, tuple(near), half_side)
 
 
 def _points(image: Residual, neighbors: list[tuple[Residual, float]], always: Floats, half_side: float) -> Points:
     """neighbors: images and how many time steps they are apart. always: of `_always`."""
     directions, blurred, colors = image.rays(RAYS)
-    if len(directions) == 0 or not neighbors:
-        empty = np.zeros((0, 3), np.float32)
-        return Points(empty, empty, np.zeros(0, np.float32))
+    if not len(directions):
+        return Points(directions, colors, directions[:, 0])
     eye = image.camera.position.astype(np.float32)
     depths = _depths(eye, directions, half_side)
     places = eye + depths[..., None] * directions[:, None]
@@ -175,12 +177,6 @@ def _middle_of_best(scores: NDArray[np.floating]) -> NDArray[np.float64]:
     first = np.where(worse & (index < best), index, -1).max(axis=1) + 1
     last = np.where(worse & (index > best), index, scores.shape[1]).min(axis=1) - 1
     return 0.5 * (first + last)
-
-
-def _dense(points: Points, half_side: float) -> Points:
-    """The points without isolated ones."""
-    distances, _ = cKDTree(points.positions).query(points.positions, k=5)
-    return points.chosen(distances[:, 4] < LONELY * half_side)
 
 
 def _always(images: Sequence[Residual], half_side: float) -> Floats:

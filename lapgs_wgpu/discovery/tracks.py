@@ -61,6 +61,11 @@ class Tracks(NamedTuple):
         """(T, 3) the mean of the points of part k."""
         return self.paths[:, self.part == k].mean(axis=1)
 
+    def radius(self, k: int) -> float:
+        """Of the ball around part k."""
+        arms = self.paths[:, self.part == k] - self.center(k)[:, None]
+        return float(np.quantile(np.linalg.norm(arms, axis=2), 0.9))
+
     def of_parts(self, kept: NDArray[np.bool_]) -> "Tracks | None":
         """The tracks of the parts (p,) that are set, and numbered anew; None where there are none."""
         chosen = kept[self.part]

@@ -20,8 +20,7 @@ from lapgs_wgpu.data.timestamps import time_step
 from lapgs_wgpu.discovery.residual import Floats
 from lapgs_wgpu.discovery.surface_points import PointClouds
 
-LEAST_GROUP = 6  # points
-FULL_GROUP = 20  # points, from which on a group counts in full
+LEAST_GROUP, FULL_GROUP = 6, 20  # points of a group, and from which on it counts in full
 LEAP = 6  # time steps from one group of a path to the next, at most
 SKIPPED = 0.1  # cost of a time that a path leaps over; a group on it is worth 1
 AGAIN = 0.1  # worth of a group that is on an earlier path
@@ -84,9 +83,8 @@ def _groups(clouds: PointClouds) -> _Groups:
     for i, points in enumerate(clouds.clouds):
         part = clouds.parts(points)
         for k in np.flatnonzero(np.bincount(part, minlength=1) >= LEAST_GROUP):
-            members = part == k
-            center, color = points.positions[members].mean(axis=0), points.colors[members].mean(axis=0)
-            rows.append([i, *center, *color, min(1.0, members.sum() / FULL_GROUP)])
+            positions, colors, scores = points.chosen(part == k)
+            rows.append([i, *positions.mean(axis=0), *colors.mean(axis=0), min(1.0, len(scores) / FULL_GROUP)])
     table = np.array(rows, np.float64).reshape(-1, 8)
     of_groups = table[:, 0].astype(np.int64), table[:, 1:4], table[:, 4:7], table[:, 7].copy()
     return _Groups(clouds.times / time_step(clouds.times), clouds.half_side, *of_groups)

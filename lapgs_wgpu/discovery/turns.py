@@ -23,7 +23,6 @@ Doubles = NDArray[np.float64]
 
 PIXELS, SAMPLES = 2000, 150  # of an image, and of a part in it, at most
 LEAST_SAMPLES, LEAST_TIMES = 10, 12  # of a part in an image, and at which it is seen
-ROUND = 0.9  # quantile of the distances of a part's points from its center that is the radius of the ball
 RIM = 0.9  # radii of the ball; beyond, pixels are mixed with what lies behind
 INSIDE = 0.75  # radii of the larger of two parts, within which the center of the other is of the same thing
 OVERLAP = 1.2  # radii of a part, within which pixels may show it
@@ -64,19 +63,13 @@ def harmonics(x: Any, y: Any, z: Any) -> list[Any]:
     return [0 * x + 1, x, y, z, x * y, y * z, z * x, x * x - y * y, 3 * z * z - 1]
 
 
-def part_radius(tracks: Tracks, k: int) -> float:
-    """Radius of the ball around part k."""
-    paths = tracks.paths[:, tracks.part == k]
-    return float(np.quantile(np.linalg.norm(paths - paths.mean(axis=1, keepdims=True), axis=2), ROUND))
-
-
 def find_turns(
     tracks: Tracks, times: Doubles, images: Sequence[Residual]
 ) -> tuple[NDArray[np.int64], dict[int, Doubles]]:
     """(p,) which part stands for each, since several may be one thing; and by the number of each of these that turns
     its rotations (T, 3, 3) at the times (T,), from whatever orientation."""
     centers = [tracks.center(k) for k in range(tracks.parts)]
-    radii = np.array([part_radius(tracks, k) for k in range(len(centers))])
+    radii = np.array([tracks.radius(k) for k in range(len(centers))])
     stands = _one_of_each(centers, radii)
     things = np.unique(stands)
     middles, sizes = np.stack([centers[k] for k in things], axis=1), radii[things]
