@@ -48,7 +48,6 @@ FOLLOWING = "motion discovery: following what moves from one time to the next"  
 SHOWN = 2.0 / 255  # of a channel: least difference from the background, and by which a part changes a pixel
 SCALE, OPACITY = 0.4, 0.3  # of a track's Gaussian; in mean distances to its nearest neighbours: more lie behind it
 SHEET_SCALE, SHEET_OPACITY = 1.2, 0.9  # the same of parts that are sheets
-IMAGES = 60  # by which a part is judged, at most
 MOVING = 0.5  # share of the pixels in which a part shows that move, at least
 GAIN = 0.05  # or share of the static fit's error there that it takes away: where several images show each time
 NEAR = 0.1  # box half sides; distance within which a track explains a surface point
@@ -141,9 +140,8 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
 
 
 class _Found(NamedTuple):
-    """static: what stands still. tracks: of what moves, over the times (T,). share: of the points of what moves, those
-    that tracks explain. origin: of what stands still, in words. light: on rigid bodies. sheets: whether each part is
-    a sheet. corrections: of cameras."""
+    """static: what stands still, and origin: in words. tracks: of what moves, over the times (T,), and the share of its
+    points that they explain. light: on rigid bodies. sheets: whether parts are sheets. corrections: of cameras."""
 
     static: Scene4D
     tracks: Tracks | None
@@ -223,7 +221,7 @@ def tracks_in_images(
         scene = Scene4D(rows_with(static, part), static.field_config, static.device, sh_degree=static.sh_degree)
         scene.antialiased = static.antialiased
         means, sums = scene.parameters["means"].detach()[len(static) :], np.zeros(4)
-        for image in evenly(images, IMAGES):
+        for image in evenly(images, 60):
             means[:] = torch.from_numpy(part.paths[np.searchsorted(times, image.time)])
             rendered = scene.render(image.camera, image.time, level, depth=False).image.numpy(force=True)
             shows = np.abs(rendered - image.still).max(axis=2) > SHOWN

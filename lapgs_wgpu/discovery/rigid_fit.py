@@ -20,7 +20,6 @@ from lapgs_wgpu.splat.rasterize import rasterize
 
 POINTS = 300  # of a body
 SPACING = 0.5  # standard deviation of a Gaussian in distances of a body's points, at first
-OPACITY = 3.0  # logit, at first
 STEPS = 800
 RATES = {"points": 2e-3, "colors": 2e-2, "sizes": 1e-2, "opacities": 3e-2, "light": 5e-3, "turns": 1e-2, "shifts": 1e-3}
 LAST = 0.05  # of these rates, in the end; they fall over the second half
@@ -57,7 +56,7 @@ def rigid_tracks(
         "points": torch.from_numpy(directions(POINTS)).float() * radii[:, None, None],
         "colors": torch.cat([torch.full((count, 3), 0.4), soft_colors]),
         "sizes": torch.cat([size, soft_size]),
-        "opacities": torch.full((count + len(soft_size),), OPACITY),
+        "opacities": torch.full((count + len(soft_size),), 3.0),
         "light": torch.eye(9)[0].repeat(len(parts), 1),
         "turns": torch.zeros(len(times), len(parts), 3),
         "shifts": torch.zeros(len(times), len(parts), 3),

@@ -20,7 +20,6 @@ from lapgs_wgpu.train.exposure import without_exposure
 from lapgs_wgpu.train.trainer import Trainer
 
 MOST_VIEWS = 400  # of a capture, evenly chosen over the clip
-RIM = 2  # pixels around what moves that the fit does not look at, either
 SOLID = 0.5  # alpha from which on something is there
 # The schedule, in shares of its steps, and the rates are its own: what the static fit is sure of decides what is found.
 SCHEDULE = {
@@ -114,9 +113,9 @@ def depth_of(scene: Scene4D, camera: Camera) -> Floats:
 
 
 def _without_movers(view: View) -> View:
-    """The view, whose moving pixels the loss leaves out."""
+    """The view, whose moving pixels the loss leaves out, and two around them."""
     if view.moving is None:
         return view
-    moving = ndimage.binary_dilation(view.moving(), iterations=RIM)
+    moving = ndimage.binary_dilation(view.moving(), iterations=2)
     ignored = view.load_ignored()
     return dataclasses.replace(view, ignored=lambda: moving if ignored is None else moving | ignored)

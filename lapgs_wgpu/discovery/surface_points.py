@@ -25,7 +25,6 @@ from lapgs_wgpu.data.views import AROUND, Dataset, View, composite, small_views
 from lapgs_wgpu.discovery.residual import Floats, Mask, Residual, cubic_grid
 from lapgs_wgpu.progress import counted
 
-RAYS = 300  # of an image, at most
 DEPTHS = 64  # that are tried along a ray
 NEIGHBORS = 6  # images that vote on a depth, those nearest in time
 COLOR_SPREAD = 0.25  # standard deviation of the colors of one surface in several images
@@ -41,7 +40,6 @@ LONELY = 0.12  # a point is dropped whose fourth neighbour is further
 LINK = 0.11  # points closer than this are of one part
 TINT = 1.0  # `PointClouds.tint` between cameras all around: hands that hold a ball are not of one color with it
 # Of the visual hull:
-SIDE = 160  # pixels, of the images that are compared
 CELLS = 96  # along each axis of the cube
 DIFFERENT = 20.0  # levels of 255; mean of channels and neighboring pixels, from which on a pixel differs
 WHOLE = 0.5  # share of an image, above which not what moves differs, but its exposure
@@ -120,7 +118,7 @@ def surface_points(images: Sequence[Residual], half_side: float) -> PointClouds:
 
 def _points(image: Residual, neighbors: list[tuple[Residual, float]], always: Floats, half_side: float) -> Points:
     """neighbors: images and how many time steps they are apart. always: of `_always`."""
-    directions, blurred, colors = image.rays(RAYS)
+    directions, blurred, colors = image.rays(300)
     if not len(directions):
         return Points(directions, colors, directions[:, 0])
     eye = image.camera.position.astype(np.float32)
@@ -227,7 +225,7 @@ def _still_camera(
     views: list[View], places: NDArray[np.float32]
 ) -> tuple[dict[float, View], NDArray[np.float32], NDArray[np.int32]]:
     """Small views, by time; their usual image (h, w, 3); and the pixel (n,) that shows each place, -1 where none."""
-    small = sorted(small_views(views, SIDE), key=lambda view: view.time)
+    small = sorted(small_views(views, 160), key=lambda view: view.time)
     usual = np.median([composite(view.load(), BLACK) for view in evenly(small, IMAGES)], axis=0).astype(np.float32)
     camera = small[0].camera
     pixels, depths = camera.project(places)

@@ -18,9 +18,7 @@ from lapgs_wgpu.discovery.residual import Floats
 from lapgs_wgpu.discovery.surface_points import PointClouds, Points, merged
 from lapgs_wgpu.discovery.trajectories import Trajectory, find_trajectories
 
-KEY_TIMES = 4  # from which is tracked, at most
 LEAST_REST = 0.05  # share of the points without a track that is worth another key time
-MANY = (0.5, 0.75)  # quantiles, over the times, of how many parts are apart; each gives key times of its own
 # In half sides of the box, 1.3 in the presets:
 VOXEL = 0.045  # spacing of a track's points
 REACH = 0.07  # distance within which a track explains a point
@@ -94,7 +92,7 @@ def find_tracks(clouds: PointClouds) -> Tracks | None:
     """
     closest, best = 0.0, None
     for trajectories in find_trajectories(clouds):
-        for many in MANY:
+        for many in (0.5, 0.75):
             if (tracks := _tracks_by(many, clouds, trajectories)) is None:
                 continue
             apart = [distances / (CLOSE * clouds.half_side) for distances, _ in clouds.nearest(tracks.paths)]
@@ -109,7 +107,7 @@ def _tracks_by(many: float, clouds: PointClouds, trajectories: list[Trajectory])
     """The tracks from key times at which as many parts are apart as this quantile of all times has."""
     free = [np.ones(len(cloud.scores), bool) for cloud in clouds.clouds]
     found: list[Tracks] = []
-    for _ in range(KEY_TIMES):
+    for _ in range(4):
         rest = [cloud.chosen(mask) for cloud, mask in zip(clouds.clouds, free, strict=True)]
         key = _key_time(rest, many, clouds)
         if sum(len(points.scores) for points in rest) < LEAST_REST * clouds.total or key is None:
@@ -162,10 +160,8 @@ def _voxels(points: Points, size: float, least: int) -> Points:
 def _tracks_from(
     key: int, start: Points, clouds: PointClouds, trajectories: list[Trajectory]
 ) -> tuple[Tracks, Floats] | None:
-    """The points of a key time, followed twice: first those of that time, then with all that belongs to them.
-
-    Returns the tracks, and their paths before these were smoothed, which are nearer to the points of each time.
-    """
+    """The points of a key time, followed twice: first those of that time, then with all that belongs to them; and their
+    paths before these were smoothed, which are nearer to the points of each time."""
     found = None
     for most, least in (150, 1), (300, 3):
         if found is not None:

@@ -25,7 +25,6 @@ LEAP = 6  # time steps from one group of a path to the next, at most
 SKIPPED = 0.1  # cost of a time that a path leaps over; a group on it is worth 1
 AGAIN = 0.1  # worth of a group that is on an earlier path
 LEAST_WORTH = 8.0  # of a path
-MOST = 8  # paths
 COLOR_SPREAD = 0.15
 AT_ONCE = 0.75  # quantile, over the times, of the number of groups: so many paths are given groups one to one
 SHARP = 2.0  # highest cost of a bend, and of a change of color
@@ -62,7 +61,7 @@ def find_trajectories(clouds: PointClouds) -> list[list[Trajectory]]:
     found, where that differs."""
     groups = _groups(clouds)
     paths: list[list[int]] = []
-    while len(paths) < MOST:
+    while len(paths) < 8:
         path, worth = _best_path(groups)
         if worth < LEAST_WORTH:
             break
