@@ -110,10 +110,11 @@ def surface_points(images: Sequence[Residual], half_side: float) -> PointClouds:
         nearest = [n for n in np.argsort(lapses, kind="stable") if n != i][:NEIGHBORS]
         neighbors = [(images[n], float(lapses[n])) for n in nearest]
         found[np.searchsorted(times, image.time)].append(_points(image, neighbors, always, half_side))
-    clouds = [merged(each) for each in found]
-    fourth = [cKDTree(cloud.positions).query(cloud.positions, k=5)[0][:, 4] for cloud in clouds]
-    near = [cloud.chosen(away < LONELY * half_side) for cloud, away in zip(clouds, fourth, strict=True)]
-    return PointClouds(times, tuple(near), half_side)
+    clouds = []
+    for points in map(merged, found):
+        distances, _ = cKDTree(points.positions).query(points.positions, k=5)
+        clouds.append(points.chosen(distances[:, 4] < LONELY * half_side))
+    return PointClouds(times, tuple(clouds), half_side)
 
 
 def _points(image: Residual, neighbors: list[tuple[Residual, float]], always: Floats, half_side: float) -> Points:

@@ -112,11 +112,11 @@ def _tracks_by(many: float, clouds: PointClouds, trajectories: list[Trajectory])
         key = _key_time(rest, many, clouds)
         if sum(len(points.scores) for points in rest) < LEAST_REST * clouds.total or key is None:
             break
-        weights = (np.where(mask, 1.0, EXPLAINED).astype(np.float32) for mask in free)
-        weighted = (
-            cloud._replace(scores=cloud.scores * each) for cloud, each in zip(clouds.clouds, weights, strict=True)
+        weighted = tuple(
+            points._replace(scores=points.scores * np.where(mask, 1.0, EXPLAINED).astype(np.float32))
+            for points, mask in zip(clouds.clouds, free, strict=True)
         )
-        followed = _tracks_from(key, _around(rest, key), clouds._replace(clouds=tuple(weighted)), trajectories)
+        followed = _tracks_from(key, _around(rest, key), clouds._replace(clouds=weighted), trajectories)
         if followed is None:
             break
         tracks, paths = followed
