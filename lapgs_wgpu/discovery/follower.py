@@ -17,7 +17,6 @@ from lapgs_wgpu.discovery.trajectories import Trajectory
 
 LEAST_PART = 12  # points
 MEMORY = 6  # times from which a motion is predicted
-COLOR_SPREAD, NEAR_COLOR_SPREAD = 0.3, 0.35  # in the registration and in the search
 NOISE = 0.1  # weight of the hypothesis that a point belongs to no track
 LOST = 0.3  # a part is lost where it explains less than this share of what it usually does
 UNIT = 0.077  # half sides of the box; half the size of a small object: the search goes by this
@@ -26,7 +25,6 @@ SEARCH = 2.4  # radius around the predicted place
 ROUGH = cubic_grid(np.arange(-SEARCH, SEARCH + 1e-6, 1.2, dtype=np.float32))  # shifts of a rough search
 ROUGH = ROUGH[np.linalg.norm(ROUGH, axis=1) < SEARCH + 1e-3]
 FINE = cubic_grid(np.arange(-0.6, 0.6 + 1e-6, 0.6, dtype=np.float32))  # and of a fine one around its best places
-SEARCH_SPREADS = 0.9, 0.5  # standard deviation of the distance from a part at which it explains a point
 FAST = 2.5  # the search reaches as far as this many times the way from one time to the next
 PRIOR = 2.0  # standard deviation of the true place around it
 STIFF, SOFT = 5.0, 2.0  # standard deviation of the kernel over which a part moves together, first and last
@@ -112,7 +110,7 @@ class Follower:
         for part in self._parts:
             free *= 1.0 - 0.9 * self._search(part, positions, points, free, i)
         data, weights = points.positions, points.scores[:, None]
-        alike = 0.2 + 0.8 * np.exp(-_sq_distances(points.colors, self.colors) / (2 * COLOR_SPREAD**2))
+        alike = 0.2 + 0.8 * np.exp(-_sq_distances(points.colors, self.colors) / (2 * 0.3**2))
         for share in (0.0, 0.25, 0.5, 0.75, 1.0):
             spread = self._unit * WIDE ** (1 - share) * NARROW**share
             belongs = alike * np.exp(-_sq_distances(data, positions) / (2 * spread**2))
@@ -132,11 +130,11 @@ class Follower:
             starts.append(part.expected[i] - positions[part.members].mean(axis=0))
         reaches, spreads = np.array([reach, 1.0], np.float32), np.array([widening, 1.0]) * PRIOR * self._unit
         some = part.members[evenly_indices(len(part.members), 24)]
-        pairs = 0.3 + 0.7 * np.exp(-_sq_distances(points.colors, self.colors[some]) / (2 * NEAR_COLOR_SPREAD**2))
+        pairs = 0.3 + 0.7 * np.exp(-_sq_distances(points.colors, self.colors[some]) / (2 * 0.35**2))
 
         def explained(shifts: Floats, spread: float) -> tuple[Floats, NDArray[np.float64], Floats]:
             """(s,) how much of the points the part explains when it is moved by each of the shifts (s, 3), (s,) how
-            likely these are, and (s, m) how near it then is to each of the points."""
+            likely these are, and (s, m) how near it then is to each of the points. spread: standard deviation, UNIT."""
             moved = (points.positions.T[:, None] - shifts.T[:, :, None]).reshape(3, -1)
             nearest, squared = _nearest(moved, positions[some])
             near = np.exp(-squared / (2 * (spread * self._unit) ** 2)).reshape(len(shifts), -1)
@@ -147,11 +145,11 @@ class Follower:
 
         rough = self._unit * ROUGH
         shifts = np.concatenate([start + scale * rough for start, scale in zip(starts, reaches, strict=False)])
-        scores, likely, _ = explained(shifts, SEARCH_SPREADS[0])
+        scores, likely, _ = explained(shifts, 0.9)
         chosen = np.argsort(-scores * likely, kind="stable")[:4]
         scale = reaches[chosen // len(rough)][:, None, None]
         shifts = (shifts[chosen][:, None] + scale * (self._unit * FINE)).reshape(-1, 3)
-        scores, likely, near = explained(shifts, SEARCH_SPREADS[1])
+        scores, likely, near = explained(shifts, 0.5)
         best = int((scores * likely).argmax())
         if part.usual and scores[best] < LOST * np.median(part.usual):
             part.lost += 1

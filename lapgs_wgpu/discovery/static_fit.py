@@ -20,7 +20,6 @@ from lapgs_wgpu.train.exposure import without_exposure
 from lapgs_wgpu.train.trainer import Trainer
 
 MOST_VIEWS = 400  # of a capture, evenly chosen over the clip
-SOLID = 0.5  # alpha from which on something is there
 # The schedule, in shares of its steps, and the rates are its own: what the static fit is sure of decides what is found.
 SCHEDULE = {
     "schedule.sh_interval": 0.375,
@@ -109,7 +108,7 @@ def depth_of(scene: Scene4D, camera: Camera) -> Floats:
         of_each = still.means, still.quats, still.scales, still.opacities, colors
         drawn = rasterize(*of_each, camera, antialiased=still.antialiased, device=scene.device)
     alpha, total = drawn.alpha.numpy(force=True), drawn.image[..., 0].numpy(force=True)
-    return np.where(alpha > SOLID, alpha / np.maximum(total, 1e-9), np.nan).astype(np.float32)
+    return np.where(alpha > 0.5, alpha / np.maximum(total, 1e-9), np.nan).astype(np.float32)
 
 
 def _without_movers(view: View) -> View:

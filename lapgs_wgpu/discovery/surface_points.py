@@ -26,12 +26,10 @@ from lapgs_wgpu.discovery.residual import Floats, Mask, Residual, cubic_grid
 from lapgs_wgpu.progress import counted
 
 DEPTHS = 64  # that are tried along a ray
-NEIGHBORS = 6  # images that vote on a depth, those nearest in time
 COLOR_SPREAD = 0.25  # standard deviation of the colors of one surface in several images
 COLOR_SHARE = 0.7  # of a vote that depends on the color
 GRID = 48  # cells along an axis of the grid of what is residual at all times
 ALWAYS, ALWAYS_WIDTH = 0.8, 0.25  # share of all images, above which a residual is no motion; width of the transition
-LEAST_SCORE = 0.5  # of a point
 PLATEAU = 0.1  # scores within this share of the best one count as equal; their middle is taken
 # In half sides of the box, 1.3 in the presets:
 MOTION = 0.05  # way from one time to the next that a depth must allow for
@@ -42,7 +40,6 @@ TINT = 1.0  # `PointClouds.tint` between cameras all around: hands that hold a b
 # Of the visual hull:
 CELLS = 96  # along each axis of the cube
 DIFFERENT = 20.0  # levels of 255; mean of channels and neighboring pixels, from which on a pixel differs
-WHOLE = 0.5  # share of an image, above which not what moves differs, but its exposure
 AGREEING = 0.9  # share of the cameras that see a place, in which it differs
 POINTS = 1500  # of a time, at most
 BLACK = 0.0, 0.0, 0.0
@@ -107,7 +104,7 @@ def surface_points(images: Sequence[Residual], half_side: float) -> PointClouds:
     found: list[list[Points]] = [[] for _ in times]
     for i, image in enumerate(images):
         lapses = np.abs(taken - image.time) / step
-        nearest = [n for n in np.argsort(lapses, kind="stable") if n != i][:NEIGHBORS]
+        nearest = [n for n in np.argsort(lapses, kind="stable") if n != i][:6]
         neighbors = [(images[n], float(lapses[n])) for n in nearest]
         found[np.searchsorted(times, image.time)].append(_points(image, neighbors, always, half_side))
     clouds = []
@@ -156,7 +153,7 @@ def _points(image: Residual, neighbors: list[tuple[Residual, float]], always: Fl
     depth = depths[np.arange(len(scores)), low] + (middle - low) * (depths[:, 1] - depths[:, 0])
     positions = eye + depth[:, None] * directions
     best = scores.max(axis=1)
-    return Points(positions.astype(np.float32), colors, best.astype(np.float32)).chosen(best > LEAST_SCORE)
+    return Points(positions.astype(np.float32), colors, best.astype(np.float32)).chosen(best > 0.5)
 
 
 def _depths(eye: Floats, directions: Floats, half_side: float) -> Floats:
@@ -205,7 +202,7 @@ def hull_points(dataset: Dataset, half_side: float) -> PointClouds:
                 continue
             image = composite(view.load(), BLACK)
             differs = ndimage.uniform_filter(np.abs(image - usual).mean(axis=2), 3) > DIFFERENT
-            if differs.mean() > WHOLE:
+            if differs.mean() > 0.5:  # not what moves, but its exposure
                 continue
             shown.append((image, differs, pixel))
             seeing += pixel >= 0

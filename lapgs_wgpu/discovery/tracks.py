@@ -18,7 +18,6 @@ from lapgs_wgpu.discovery.residual import Floats
 from lapgs_wgpu.discovery.surface_points import PointClouds, Points, merged
 from lapgs_wgpu.discovery.trajectories import Trajectory, find_trajectories
 
-LEAST_REST = 0.05  # share of the points without a track that is worth another key time
 # In half sides of the box, 1.3 in the presets:
 VOXEL = 0.045  # spacing of a track's points
 REACH = 0.07  # distance within which a track explains a point
@@ -33,7 +32,6 @@ LEAPS, LEAP_SIZE = (
 EVEN = 0.35  # variation of the number of points that a part explains, relative to their mean, of one thing
 EXPLAINED = 0.3  # weight of points that an earlier key time's tracks explain
 SMOOTHING = 2.0  # times; standard deviation of the weights by which paths are smoothed
-UNSUPPORTED = 0.1  # weight of a time at which a part is not seen
 SUPPORTED = 0.3  # share of a part's points with surface points within REACH, from which on it is seen
 
 
@@ -110,7 +108,7 @@ def _tracks_by(many: float, clouds: PointClouds, trajectories: list[Trajectory])
     for _ in range(4):
         rest = [cloud.chosen(mask) for cloud, mask in zip(clouds.clouds, free, strict=True)]
         key = _key_time(rest, many, clouds)
-        if sum(len(points.scores) for points in rest) < LEAST_REST * clouds.total or key is None:
+        if sum(len(points.scores) for points in rest) < 0.05 * clouds.total or key is None:
             break
         weighted = tuple(
             points._replace(scores=points.scores * np.where(mask, 1.0, EXPLAINED).astype(np.float32))
@@ -178,7 +176,7 @@ def _tracks_from(
             seen = near[:, members].mean(axis=1) > SUPPORTED
             supported[:, members] = seen[:, None]
             # The image of a time shows one side of a part, and pulls it towards that side.
-            fitted = parabolas(clouds.times, np.where(seen, 1.0, UNSUPPORTED), SMOOTHING)
+            fitted = parabolas(clouds.times, np.where(seen, 1.0, 0.1), SMOOTHING)
             smooth[:, members] = np.tensordot(fitted, paths[:, members], axes=1)
         found = Tracks(follower.positions, follower.colors, follower.part, smooth, supported), paths
     return found

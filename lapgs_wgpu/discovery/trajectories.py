@@ -26,7 +26,6 @@ SKIPPED = 0.1  # cost of a time that a path leaps over; a group on it is worth 1
 AGAIN = 0.1  # worth of a group that is on an earlier path
 LEAST_WORTH = 8.0  # of a path
 COLOR_SPREAD = 0.15
-AT_ONCE = 0.75  # quantile, over the times, of the number of groups: so many paths are given groups one to one
 SHARP = 2.0  # highest cost of a bend, and of a change of color
 WINDOW = 1.0  # time steps; standard deviation of the weights by which a path is smoothed
 # In half sides of the box:
@@ -67,7 +66,7 @@ def find_trajectories(clouds: PointClouds) -> list[list[Trajectory]]:
             break
         groups.worth[path] *= AGAIN
         paths.append(path)
-    at_once = int(np.quantile(np.bincount(groups.time, minlength=len(groups.clock)), AT_ONCE))
+    at_once = int(np.quantile(np.bincount(groups.time, minlength=len(groups.clock)), 0.75))
     given = _one_to_one(groups, paths[:at_once]) + paths[at_once:]
 
     def trajectory(path: list[int]) -> Trajectory:

@@ -26,10 +26,7 @@ LEAST_SAMPLES, LEAST_TIMES = 10, 12  # of a part in an image, and at which it is
 RIM = 0.9  # radii of the ball; beyond, pixels are mixed with what lies behind
 INSIDE = 0.75  # radii of the larger of two parts, within which the center of the other is of the same thing
 OVERLAP = 1.2  # radii of a part, within which pixels may show it
-UNSEEN = 1e-3  # weight of a time that shows no outline
 DARK = 0.2  # least light, of the mean brightness
-KEYS = 3  # times around which the turn is looked for
-WINDOW = 8.0  # time steps on either side
 FASTEST = 36.0  # degrees a time step
 # The searches, from rough to fine: degrees between turns, half of those before; time steps on either side over which
 # images are compared; and how many turns the next one looks around.
@@ -37,7 +34,6 @@ SEARCHES = (8.0, 3, 12), (4.0, 5, 4), (2.0, 8, 1)
 CELL, FINE = 0.18, 0.12  # radii; size of the places at which colors are compared, in the search and from there on
 SIDE = int(2 / FINE) + 3  # of these along an axis
 BLUR = 1.0  # FINE; standard deviation of the weights by which the colors around a place tell its color
-KEPT = 5  # time steps from the key time, up to which its turn is kept
 AROUND = (6.0, 2), (2.0, 2), (1.0, 1)  # degrees of a step and number of steps, of the search for the turn of a time
 AS_BEFORE = 36.0  # degrees beside the turn that goes on as before, that weigh as much as all differences of color
 MEMORY = 4  # times by which a turn goes on
@@ -109,7 +105,7 @@ def _one_of_each(centers: Sequence[Floats], radii: Doubles) -> NDArray[np.int64]
 def _outlined(times: Doubles, centers: Floats, radii: Doubles, images: Sequence[Residual]) -> tuple[Floats, Doubles]:
     """Centers (T, p, 3) and radii (p,) of parts as the outlines of what moves tell, of those that stand alone and whole
     in an image. Where several images show a time, the last one tells."""
-    shifts, seen = np.zeros(centers.shape), np.full(centers.shape[:2], UNSEEN)
+    shifts, weights = np.zeros(centers.shape), np.full(centers.shape[:2], 1e-3)
     sizes: list[list[float]] = [[] for _ in radii]
     for image in images:
         at, K, T = int(np.searchsorted(times, image.time)), image.camera.K, image.camera.T_cam_world
@@ -124,12 +120,12 @@ def _outlined(times: Doubles, centers: Floats, radii: Doubles, images: Sequence[
                 continue
             x, y = (np.array([columns, rows]) + 0.5).mean(axis=1) - middles[n]
             away = np.array([x / K[0, 0], y / K[1, 1], 0.0])
-            shifts[at, n], seen[at, n] = depths[n] * away @ T[:3, :3], 1.0
+            shifts[at, n], weights[at, n] = depths[n] * away @ T[:3, :3], 1.0
             sizes[n].append(float(np.sqrt(len(rows) / np.pi) * depths[n] / K[0, 0]))
     moved, found = centers.copy(), radii.copy()
     for n, each in enumerate(sizes):
         if len(each) >= LEAST_TIMES:
-            moved[:, n] += parabolas(times, seen[:, n], OUTLINE_SPREAD) @ shifts[:, n]
+            moved[:, n] += parabolas(times, weights[:, n], OUTLINE_SPREAD) @ shifts[:, n]
             found[n] = np.median(each)
     return moved, found
 
@@ -186,8 +182,8 @@ def _explained(places: Doubles, colors: Floats, blocks: NDArray[np.int64] | int 
 
 def _turn_at(looks: list[_Look], clock: Doubles, key: int) -> tuple[Doubles, float]:
     """The turn (3,) a time step around a key time, a rotation vector, and how much more of the colors it explains than
-    no turn. clock: (T,) time steps."""
-    window = [i for i in np.flatnonzero(np.abs(clock - clock[key]) <= WINDOW) if len(looks[i].places)]
+    no turn. clock: (T,) time steps, of which eight on either side are looked at."""
+    window = [i for i in np.flatnonzero(np.abs(clock - clock[key]) <= 8) if len(looks[i].places)]
     lapses = clock[window] - clock[key]
     places, colors = _joined(looks[i] for i in window)
     of = np.repeat(np.arange(len(window)), [len(looks[i].places) for i in window])
@@ -213,16 +209,17 @@ def _turn_at(looks: list[_Look], clock: Doubles, key: int) -> tuple[Doubles, flo
 
 
 def _turns(looks: list[_Look], clock: Doubles) -> Doubles:
-    """(T, 3, 3) rotations of a part, from the key time at which a turn explains most. clock: (T,) time steps."""
+    """(T, 3, 3) rotations of a part, from the key time at which a turn explains most, which up to five time steps from
+    there is kept. clock: (T,) time steps."""
     seen = np.flatnonzero([len(look.places) for look in looks])
-    keys = np.unique(seen[evenly_indices(len(seen), KEYS + 2)[1:-1]]).tolist()
+    keys = np.unique(seen[evenly_indices(len(seen), 5)[1:-1]]).tolist()
     turn, _, key = max(((*_turn_at(looks, clock, key), key) for key in keys), key=lambda found: found[1])
     lapses = clock - clock[key]
     R = Rotation.from_rotvec(lapses[:, None] * turn).as_matrix()
     known = np.zeros((4, SIDE, SIDE, SIDE))
     for i in sorted(range(len(looks)), key=lambda i: (abs(i - key), i)):
         last = i - np.sign(i - key) * np.arange(1, MEMORY + 2)
-        if abs(lapses[i]) > KEPT and 0 <= last[-1] < len(looks):
+        if abs(lapses[i]) > 5 and 0 <= last[-1] < len(looks):
             steps = Rotation.from_matrix(R[last[:-1]] @ np.swapaxes(R[last[1:]], 1, 2)).as_rotvec()
             turn = (steps / (clock[last[:-1]] - clock[last[1:]])[:, None]).mean(axis=0)
             onward = Rotation.from_rotvec((clock[i] - clock[last[0]]) * turn).as_matrix()
