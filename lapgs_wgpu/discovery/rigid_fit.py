@@ -51,6 +51,7 @@ def rigid_tracks(
     count = len(parts) * POINTS
     size = torch.log(SPACING * (4 * np.pi / POINTS) ** 0.5 * radii).repeat_interleave(POINTS)
     soft_size = torch.full((len(soft_colors),), float(size.mean()))
+    quats = torch.tensor([1.0, 0, 0, 0]).repeat(count + len(soft_size), 1)
     around = {name: torch.from_numpy(parabolas(times, 1.0, spread)).float() for name, spread in SPREADS.items()}
     values = {
         "points": torch.from_numpy(directions(POINTS)).float() * radii[:, None, None],
@@ -86,17 +87,9 @@ def rigid_tracks(
         R, center = poses(at)
         arms = values["points"] @ R.transpose(1, 2)
         means = torch.cat([(arms + center[:, None]).reshape(-1, 3), soft_paths[at]])
-        drawn = rasterize(
-            means,
-            torch.tensor([1.0, 0, 0, 0]).repeat(len(means), 1),
-            values["sizes"].exp()[:, None].repeat(1, 3),
-            values["opacities"].sigmoid(),
-            values["colors"] * torch.cat([light_on(arms).reshape(-1, 1), torch.ones(len(soft_size), 1)]),
-            image.camera,
-            antialiased=True,
-            depth=False,
-            device=device,
-        )
+        lit = torch.cat([light_on(arms).reshape(-1, 1), torch.ones(len(soft_size), 1)])
+        shapes = means, quats, values["sizes"].exp()[:, None].repeat(1, 3), values["opacities"].sigmoid()
+        drawn = rasterize(*shapes, values["colors"] * lit, image.camera, antialiased=True, depth=False, device=device)
         picture = drawn.image + (1 - drawn.alpha)[..., None] * torch.from_numpy(image.still)
         difference = (picture - torch.from_numpy(image.image)).abs()
         optimizer.zero_grad()
