@@ -178,9 +178,10 @@ def _in_residuals(config: Config, dataset: Dataset, device: Device, generator: t
             f"{dataset.train[0].source} and the other {len(dataset.train) - 1} training images show nothing but the "
             f"{config.data.background} background; check the images and data.background."
         )
-    sheets = depths is not None and not dataset.is_rig  # a cut-out is of one camera
+    if dataset.is_rig:
+        depths = None  # a cut-out is of one camera
     light: dict[int, Floats] = {}
-    if sheets:
+    if depths is not None:
         times = np.array([image.time for image in images])
         tracks, share = cutout_tracks(images, depths, half_side)
     else:
@@ -192,12 +193,12 @@ def _in_residuals(config: Config, dataset: Dataset, device: Device, generator: t
         share = explained_share(clouds, tracks)
     if share < config.discovery.least:
         tracks = None
-    elif tracks is not None and not sheets:
+    elif tracks is not None and depths is None:
         stands, turns = find_turns(tracks, times, images)
         if turns:
             tracks, light = rigid_tracks(tracks, stands, turns, times, images, device, generator)
     meter.clear()
-    return _Found(static, tracks, times, share, "a static fit", light, sheets, corrections)
+    return _Found(static, tracks, times, share, "a static fit", light, depths is not None, corrections)
 
 
 def tracks_in_images(
