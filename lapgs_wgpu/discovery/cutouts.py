@@ -2,8 +2,7 @@
 
 A cut-out is what is connected in the mask of one image and not mostly explained by earlier ones. It is followed from
 image to image by an affine map of its colors (Baker and Matthews, Lucas-Kanade 20 years on, IJCV 2004), until it no
-longer looks alike. It stands upright at the depth of the ground below it. Each image shows the cut-outs of the nearest
-images alone.
+longer looks alike. It stands upright at the depth of the ground below it. Images show those of the nearest ones alone.
 """
 
 from collections.abc import Sequence
@@ -49,8 +48,7 @@ class _Cutout(NamedTuple):
 def cutout_tracks(
     residuals: Sequence[Residual], depths: Sequence[Floats], half_side: float
 ) -> tuple[Tracks | None, float]:
-    """Tracks of what moves in the images of one camera, None where nothing does, and the share of the moving pixels
-    that they explain.
+    """Tracks of what moves in images of one camera, None where nothing does, and the share of it that they explain.
 
     Their positions do not share the way that all go, and those of each cut-out lie apart: the field has less to learn,
     and it tells Gaussians apart by place.

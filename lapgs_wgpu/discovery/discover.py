@@ -213,8 +213,7 @@ def tracks_in_images(
     """The parts that, each by itself, show where something moves; None where there are none.
 
     times: (T,), of the tracks. background: level of its channels. together: whether several images of the capture show
-    each time. Their depths then agree whatever moves, and a part that brings the static fit nearer to the images is
-    kept, too.
+    each time. Their depths then agree whatever moves, and a part that brings the static fit nearer to them is kept.
     """
     kept, level = np.zeros(tracks.parts, bool), torch.full((3,), background)
     for k in range(len(kept)):

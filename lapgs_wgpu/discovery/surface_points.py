@@ -67,11 +67,8 @@ def merged(parts: Iterable[Points]) -> Points:
 
 
 class PointClouds(NamedTuple):
-    """The surface points of all times (T,), ascending, and the cloud of each, within [-half_side, half_side]^3.
-
-    tint: how far apart points of one place are that differ by 1 in color, world units, where their colors tell things
-    that touch.
-    """
+    """The surface points of all times (T,), ascending, and the cloud of each, within [-half_side, half_side]^3. tint:
+    how far apart, world units, points of one place are that differ by 1 in color, where that tells what touches."""
 
     times: NDArray[np.float64]
     clouds: tuple[Points, ...]

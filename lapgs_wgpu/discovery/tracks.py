@@ -85,8 +85,7 @@ def find_tracks(clouds: PointClouds) -> Tracks | None:
     """Tracks of the surface points of a clip; None where nothing can be followed.
 
     Many parts are apart where things part, and also where one thing falls to patches. Which it is shows in how close
-    to all points the tracks come that start there. Where that is far from all, trajectories that share groups may do
-    better.
+    to all points the tracks come that start there. Where that is far, trajectories that share groups may do better.
     """
     closest, best = 0.0, None
     for trajectories in find_trajectories(clouds):
