@@ -6,6 +6,7 @@ around both finds the translation that explains most points; and a registration 
 """
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -143,12 +144,13 @@ class Follower:
             prior = [np.exp(-((shifts - at) ** 2).sum(axis=1) / (2 * width**2)) for at, width in around]
             return (near * alike * free * points.scores).sum(axis=1), np.max(prior, axis=0), near
 
-        rough = self._unit * ROUGH
+        rough: NDArray[Any] = self._unit * ROUGH
+        fine: NDArray[Any] = self._unit * FINE
         shifts = np.concatenate([start + scale * rough for start, scale in zip(starts, reaches, strict=False)])
         scores, likely, _ = explained(shifts, 0.9)
         chosen = np.argsort(-scores * likely, kind="stable")[:4]
         scale = reaches[chosen // len(rough)][:, None, None]
-        shifts = (shifts[chosen][:, None] + scale * (self._unit * FINE)).reshape(-1, 3)
+        shifts = (shifts[chosen][:, None] + scale * fine).reshape(-1, 3)
         scores, likely, near = explained(shifts, 0.5)
         best = int((scores * likely).argmax())
         if part.usual and scores[best] < LOST * np.median(part.usual):
