@@ -15,8 +15,7 @@ from synthetic import cameras
 from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.data.views import small_views
 from lapgs_wgpu.discovery import rigid_fit
-from lapgs_wgpu.discovery.acceptance import rows_with, tracks_in_images
-from lapgs_wgpu.discovery.discover import RAMP_STEPS, discover, start_training
+from lapgs_wgpu.discovery.discover import RAMP_STEPS, discover, rows_with, start_training, tracks_in_images
 from lapgs_wgpu.discovery.field_fit import fit_field
 from lapgs_wgpu.discovery.residual import Residual
 from lapgs_wgpu.discovery.static_fit import static_config, static_fit

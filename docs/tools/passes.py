@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from lapgs_wgpu import Camera, Gaussians, Scene4D, load_config
-from lapgs_wgpu.discovery.acceptance import tracks_in_images
+from lapgs_wgpu.discovery.discover import tracks_in_images
 from lapgs_wgpu.discovery.static_fit import static_fit
 from lapgs_wgpu.discovery.surface_points import surface_points
 from lapgs_wgpu.discovery.tracks import find_tracks

@@ -2,8 +2,7 @@
 
 A cut-out is what is connected in the mask of one image and not mostly explained by earlier ones. It is followed from
 image to image by an affine map of its colors (Baker and Matthews, Lucas-Kanade 20 years on, IJCV 2004), until it no
-longer looks alike. It stands upright at the depth of the ground below it. Each image shows the cut-outs of the nearest
-images alone.
+longer looks alike. It stands upright at the depth of the ground below it. Images show those of the nearest ones alone.
 """
 
 from collections.abc import Sequence
@@ -22,17 +21,13 @@ MOST = 24  # cut-outs
 LEAST = 4e-3  # share of an image that a cut-out covers, at least
 ENOUGH = 0.15  # share of an image's moving pixels that may stay unexplained
 BLURS = 4.0, 2.0, 1.0  # pixels; of the images that are compared, one after another
-ITERATIONS = 8  # of each
-PIXELS = 1500  # of a cut-out that are compared, at most
 NEWS = 0.5  # share of what a cut-out explains in an image that none of a nearer image does, at least
 POINTS = 12_000  # of all cut-outs, at most
 ALIKE = 0.12  # difference of two blurred colors that look alike
-LOST = 0.5  # share of a cut-out that must look alike
-VISIBLE = 0.3  # share of a cut-out that must lie in the image
+LOST, VISIBLE = 0.5, 0.3  # shares of a cut-out that must look alike, and lie in the image
 STIFF = 0.02  # weight of the affine part of a map against that before
 FOOT = 0.15  # of its height: the lowest part of a cut-out, which stands on the ground
-HIDDEN = 0.1  # quantile of the depths of what a cut-out hides, which lie behind it
-BEFORE = 0.9  # of the depth of the ground, and of that
+HIDDEN, BEFORE = 0.1, 0.9  # quantile of the depths of what a cut-out hides; how far before that and the ground it is
 APART = -0.5, 0.5  # half sides of the box: how far the first and the last cut-out are moved away from the cameras
 FAR_BELOW = 3  # pixels; the ground that a foot stands on lies so far below
 
@@ -53,8 +48,7 @@ class _Cutout(NamedTuple):
 def cutout_tracks(
     residuals: Sequence[Residual], depths: Sequence[Floats], half_side: float
 ) -> tuple[Tracks | None, float]:
-    """Tracks of what moves in the images of one camera, None where nothing does, and the share of the moving pixels
-    that they explain.
+    """Tracks of what moves in images of one camera, None where nothing does, and the share of it that they explain.
 
     Their positions do not share the way that all go, and those of each cut-out lie apart: the field has less to learn,
     and it tells Gaussians apart by place.
@@ -158,7 +152,7 @@ def _followed(levels: Sequence[list[Floats]], masks: Mask, key: int, pixels: NDA
 
 def _registered(source: list[Floats], target: list[Floats], pixels: NDArray[np.int64], M: Map) -> tuple[Map, float]:
     """The map (2, 3) of a cut-out's pixels to another image, near M, and the share of them that look alike there."""
-    chosen = pixels[evenly_indices(len(pixels), PIXELS)]
+    chosen = pixels[evenly_indices(len(pixels), 1500)]
     x, y = chosen.T
     middle = chosen.mean(axis=0)
     scale = max(float(chosen.std()), 1.0)
@@ -166,7 +160,7 @@ def _registered(source: list[Floats], target: list[Floats], pixels: NDArray[np.i
     height, width = source[0].shape[:2]
     for there, here in zip(target, source, strict=True):
         wanted = here[y, x, :4]
-        for _ in range(ITERATIONS):
+        for _ in range(8):
             at = M[:, :2] @ chosen.T + M[:, 2:]
             inside = (at >= 0).all(axis=0) & (at[0] <= width - 1) & (at[1] <= height - 1)
             sampled = _sampled(there, at)

@@ -1,8 +1,12 @@
-"""The start of a training: what stands still, and the things that move, which a fit of it loses; then a Trainer."""
+"""The start of a training: what stands still, and the things that move, which a fit of it loses; then a Trainer.
+
+Of the parts that were followed it takes those that show where something moves, or, where several cameras see each time,
+bring the static fit nearer to the images. Patches of what the static fit only blurs do neither.
+"""
 
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,21 +14,21 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from lapgs_wgpu.data.evenly import evenly
+from lapgs_wgpu.data.initial_gaussians import initial_scales
 from lapgs_wgpu.data.views import Dataset
-from lapgs_wgpu.discovery.acceptance import explained_share, rows_with, tracks_in_images
 from lapgs_wgpu.discovery.cutouts import cutout_tracks
 from lapgs_wgpu.discovery.field_fit import fit_field
-from lapgs_wgpu.discovery.residual import Floats
+from lapgs_wgpu.discovery.residual import Floats, Residual
 from lapgs_wgpu.discovery.rigid_fit import rigid_tracks
 from lapgs_wgpu.discovery.static_fit import static_fit
-from lapgs_wgpu.discovery.surface_points import surface_points
+from lapgs_wgpu.discovery.surface_points import PointClouds, hull_points, surface_points
 from lapgs_wgpu.discovery.tracks import Tracks, find_tracks
 from lapgs_wgpu.discovery.turns import find_turns
-from lapgs_wgpu.discovery.visual_hull import hull_points
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.own_field import check_own
-from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.motion.scene import Scene4D, isotropic_rows
 from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.morton import morton_order
 from lapgs_wgpu.train.camera_refinement import Corrections
@@ -41,7 +45,12 @@ ALL_TURN = 0.1  # of the field's highest rates, where all that moves turns: it f
 SHEETS = 0.3  # in place of it where sheets fade one after another: small ones are lost at higher rates
 RAMP_STEPS = 200  # over which learning rates rise after discovery, where schedule.warm_up is 0
 FOLLOWING = "motion discovery: following what moves from one time to the next"  # may take a minute
-SHOWN = 2.0 / 255  # least difference from the background of an image that shows something
+SHOWN = 2.0 / 255  # of a channel: least difference from the background, and by which a part changes a pixel
+SCALE, OPACITY = 0.4, 0.3  # of a track's Gaussian; in mean distances to its nearest neighbours: more lie behind it
+SHEET_SCALE, SHEET_OPACITY = 1.2, 0.9  # the same of parts that are sheets
+MOVING = 0.5  # share of the pixels in which a part shows that move, at least
+GAIN = 0.05  # or share of the static fit's error there that it takes away: where several images show each time
+NEAR = 0.1  # box half sides; distance within which a track explains a surface point
 
 
 def start_training(
@@ -100,27 +109,26 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
     generator = torch.Generator().manual_seed(config.seed)
     found = _in_hull(config, dataset, device) if dataset.is_surrounded else None
     found = found or _in_residuals(config, dataset, device, generator)
-    tracks, share, light, sheets = found.tracks, found.share, found.light, found.sheets
     scene = _scene_with(found, config, generator, own_field)
-    field_fitted, summary = 0.0, f"{share:.1%} of what it lacks can be followed: nothing is added"
-    if tracks is not None:
-        steps, parts = config.discovery.field_steps, len(np.unique(tracks.part))
+    field_fitted, summary = 0.0, f"{found.share:.1%} of what it lacks can be followed: nothing is added"
+    if (tracks := found.tracks) is not None:
+        steps, parts, bodies = config.discovery.field_steps, len(np.unique(tracks.part)), len(found.light)
         meter = Progress(steps, "steps of motion discovery, part 2 of 2: what moves")
-        error = fit_field(scene, tracks, found.times, steps, generator, meter.at, fades=sheets, light=light)
+        error = fit_field(scene, tracks, found.times, steps, generator, meter.at, fades=found.sheets, light=found.light)
         meter.clear()
         if error is None:
             summary = "the field cannot move what it lacks: nothing is added"
             scene = _scene_with(found._replace(tracks=None), config, generator, own_field)
         else:
             summary = (
-                f"{parts} moving parts with {len(tracks.part)} Gaussians, {share:.0%} of what it lacks, followed "
-                f"within {error:.3f} world units" + (f", {len(light)} of them as rigid bodies" if light else "")
+                f"{parts} moving parts with {len(tracks.part)} Gaussians, {found.share:.0%} of what it lacks, followed "
+                f"within {error:.3f} world units" + (f", {bodies} of them as rigid bodies" if bodies else "")
             )
-            if share >= NEARLY_ALL:
-                field_fitted = ALL_TURN if len(light) == parts else SHEETS if sheets else 1.0
+            if found.share >= NEARLY_ALL:
+                field_fitted = ALL_TURN if bodies == parts else SHEETS if found.sheets else 1.0
     order = morton_order(scene.parameters["means"].detach())
     for name, values in scene.parameters.items():
-        scene.parameters[name] = torch.nn.Parameter(values.detach()[order])
+        scene.parameters[name] = nn.Parameter(values.detach()[order])
     return Start(
         scene,
         ramp_steps=config.schedule.warm_up or RAMP_STEPS,
@@ -132,9 +140,8 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
 
 
 class _Found(NamedTuple):
-    """static: what stands still. tracks: of what moves, over the times (T,). share: of the points of what moves, those
-    that tracks explain. origin: of what stands still, in words. light: on rigid bodies. sheets: whether each part is
-    a sheet. corrections: of cameras."""
+    """static: what stands still, and origin: in words. tracks: of what moves, over the times (T,), and the share of its
+    points that they explain. light: on rigid bodies. sheets: whether parts are sheets. corrections: of cameras."""
 
     static: Scene4D
     tracks: Tracks | None
@@ -194,6 +201,58 @@ def _in_residuals(config: Config, dataset: Dataset, device: Device, generator: t
     return _Found(static, tracks, times, share, "a static fit", light, depths is not None, corrections)
 
 
+def tracks_in_images(
+    tracks: Tracks,
+    times: NDArray[np.float64],
+    images: Sequence[Residual],
+    static: Scene4D,
+    background: float,
+    *,
+    together: bool,
+) -> Tracks | None:
+    """The parts that, each by itself, show where something moves; None where there are none.
+
+    times: (T,), of the tracks. background: level of its channels. together: whether several images of the capture show
+    each time. Their depths then agree whatever moves, and a part that brings the static fit nearer to them is kept.
+    """
+    kept, level = np.zeros(tracks.parts, bool), torch.full((3,), background)
+    for k in range(len(kept)):
+        part = tracks.rows(tracks.part == k)
+        scene = Scene4D(rows_with(static, part), static.field_config, static.device, sh_degree=static.sh_degree)
+        scene.antialiased = static.antialiased
+        means, sums = scene.parameters["means"].detach()[len(static) :], np.zeros(4)
+        for image in evenly(images, 60):
+            means[:] = torch.from_numpy(part.paths[np.searchsorted(times, image.time)])
+            rendered = scene.render(image.camera, image.time, level, depth=False).image.numpy(force=True)
+            shows = np.abs(rendered - image.still).max(axis=2) > SHOWN
+            errors = (np.abs(each - image.image)[shows].sum() for each in (image.still, rendered))
+            sums += shows.sum(), (shows & image.mask).sum(), *errors
+        pixels, moving, before, after = sums
+        gain = 1.0 - after / max(before, 1e-6)
+        kept[k] = moving / max(pixels, 1) >= MOVING or (together and gain >= GAIN)
+    return tracks.of_parts(kept)
+
+
+def explained_share(clouds: PointClouds, tracks: Tracks | None) -> float:
+    """Of the surface points, those that lie on a track."""
+    if tracks is None:
+        return 0.0
+    near = sum(int((distances < NEAR * clouds.half_side).sum()) for distances, _ in clouds.nearest(tracks.paths))
+    return near / max(clouds.total, 1)
+
+
+def rows_with(static: Scene4D, tracks: Tracks, *, sheets: bool = False) -> dict[str, Tensor]:
+    """The Gaussians of the static fit, then one for each track at its place at the key time: the parameters of a scene
+    without a field, float32. sheets: whether each part is a sheet of its own, which nothing lies behind."""
+    scale, opacity = (SHEET_SCALE, SHEET_OPACITY) if sheets else (SCALE, OPACITY)
+    apart = tracks.part if sheets else np.zeros_like(tracks.part)
+    scales = np.empty(len(apart), np.float32)
+    for k in np.unique(apart):
+        scales[apart == k] = scale * initial_scales(tracks.positions[apart == k])
+    new = isotropic_rows(tracks.positions, tracks.colors, scales, opacity)
+    return {name: torch.cat([static.parameters[name].detach(), values]) for name, values in new.items()}
+
+
 def _scene_with(found: _Found, config: Config, generator: torch.Generator, own_field: nn.Module | None) -> Scene4D:
     """The Gaussians of what stands still, then one for each track; the field does not move them yet."""
     static, tracks, size = found.static, found.tracks, config.field.dynamics_size
@@ -203,9 +262,10 @@ def _scene_with(found: _Found, config: Config, generator: torch.Generator, own_f
         rows = rows_with(static, tracks, sheets=found.sheets)
         of_part = DYNAMICS * torch.randn(tracks.parts, size, generator=generator)
         if found.sheets and size > 1:  # shown one after another, which the field can tell by these
-            when = [tracks.supported[:, tracks.part == k].mean(axis=1) for k in range(len(of_part))]
-            middle = np.array([np.average(np.linspace(-1, 1, len(each)), weights=each) for each in when])
-            of_part[:, :2] = torch.from_numpy(np.stack([np.ones_like(middle), middle], axis=1)) * SHEET_DYNAMICS
+            for k in range(tracks.parts):
+                seen = tracks.supported[:, tracks.part == k][:, 0]
+                middle = float(np.average(np.linspace(-1, 1, len(seen)), weights=seen))
+                of_part[k, :2] = SHEET_DYNAMICS * torch.tensor([1.0, middle])
         dynamics = torch.cat([dynamics, of_part[torch.from_numpy(tracks.part)]])
     return Scene4D(
         rows | {"dynamics": dynamics},

@@ -16,7 +16,6 @@ from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.constants import CONSTANTS
 from lapgs_wgpu.train.optimizer import ADAM_EPS
 
-AT_ONCE, FEWER = 8, 2  # for tracks that fade: times that a step looks at, and how many times fewer of them it asks
 STILL = 300  # Gaussians of the static fit that a step asks to stay where they are
 MOVING = 1500  # Gaussians of tracks that a step asks, at most
 HASH_RATE, MLP_RATE = 1e-2, 2e-3  # learning rates: half of those of the preset tiny, twice train.start.MAX_*_RATE
@@ -26,7 +25,6 @@ HIDDEN = 0.1  # weight of the places of what is faded, which would else wander b
 SHEET_STIFF = 10.0  # times as much, of the scales of tracks that fade
 FADED, FADE_WEIGHT = 7.0, 0.03  # logits by which what is not seen loses opacity; weight of the distance from that
 HINGES = 3.0  # of the decoder's units, whose inputs are of the size 1: how much they change over the clip
-OPEN = 2.0  # the gate's inputs: 0.76 is let through
 WITHIN, BEYOND = 0.5, 0.3  # of the way to another point of its body, on which a step asks for one; and away from it
 LIGHT_WEIGHT = 0.03  # of the light on bodies
 SOFTENING = 1e-2  # world units; distances below count as squares
@@ -75,7 +73,7 @@ def fit_field(
         shades[:, body] = (torch.from_numpy(factors)[..., None] - 1) * colors
     order: list[int] = []
     errors: list[float] = []
-    at_once, most = (AT_ONCE, MOVING // FEWER) if fades else (1, MOVING)
+    at_once, most = (8, MOVING // 2) if fades else (1, MOVING)  # times that a step looks at, and Gaussians
     for step in range(steps):
         while len(order) < at_once:
             order = torch.randperm(len(times), generator=generator).tolist() + order
@@ -144,4 +142,4 @@ def _tell_times(field: GridField, generator: torch.Generator) -> None:
         weight[:, 1] = torch.rand(len(weight), generator=generator) * 2 - 1
         weight[:, 0] = (1 + 1 + HINGES) / 2
         field.temporal.bias.fill_(-1 - HINGES)
-        field.spatial.bias.fill_(OPEN)
+        field.spatial.bias.fill_(2.0)  # the gate lets 0.76 through

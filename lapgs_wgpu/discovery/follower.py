@@ -6,6 +6,7 @@ around both finds the translation that explains most points; and a registration 
 """
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,18 +17,15 @@ from lapgs_wgpu.discovery.surface_points import PointClouds, Points
 from lapgs_wgpu.discovery.trajectories import Trajectory
 
 LEAST_PART = 12  # points
-DATA = 160  # points of a time that a part is compared with, at most
 MEMORY = 6  # times from which a motion is predicted
-ROUNDS = 5  # of the registration
-CANDIDATES = 4  # best places of the rough search
-COLOR_SPREAD = 0.3
 NOISE = 0.1  # weight of the hypothesis that a point belongs to no track
 LOST = 0.3  # a part is lost where it explains less than this share of what it usually does
 UNIT = 0.077  # half sides of the box; half the size of a small object: the search goes by this
 # In UNIT:
 SEARCH = 2.4  # radius around the predicted place
-SEARCH_STEPS = 1.2, 0.6  # of a rough search, and of a fine one around its best places
-SEARCH_SPREADS = 0.9, 0.5  # standard deviation of the distance from a part at which it explains a point
+ROUGH = cubic_grid(np.arange(-SEARCH, SEARCH + 1e-6, 1.2, dtype=np.float32))  # shifts of a rough search
+ROUGH = ROUGH[np.linalg.norm(ROUGH, axis=1) < SEARCH + 1e-3]
+FINE = cubic_grid(np.arange(-0.6, 0.6 + 1e-6, 0.6, dtype=np.float32))  # and of a fine one around its best places
 FAST = 2.5  # the search reaches as far as this many times the way from one time to the next
 PRIOR = 2.0  # standard deviation of the true place around it
 STIFF, SOFT = 5.0, 2.0  # standard deviation of the kernel over which a part moves together, first and last
@@ -53,30 +51,25 @@ class Follower:
         self._key, self._clouds, self._unit = key, clouds, UNIT * clouds.half_side
         part = clouds.parts(template)
         kept = np.bincount(part)[part] >= LEAST_PART
-        self.positions, self.colors = template.positions[kept], template.colors[kept]
+        self.positions, self.colors, _ = template.chosen(kept)
         self.part = np.unique(part[kept], return_inverse=True)[1]
         # Large parts choose first: what they explain is less attractive to the small ones.
         members = [np.flatnonzero(self.part == k) for k in np.argsort(-np.bincount(self.part), kind="stable")]
         self._parts = [_Part(each, self._expected(each, trajectories)) for each in members]
         same = self.part[:, None] == self.part[None]
         sq_distances = ((self.positions[:, None] - self.positions[None]) ** 2).sum(axis=2)
-        self._kernels = [
+        self._stiff, self._soft = (
             np.exp(-sq_distances / (2 * (h * self._unit) ** 2)).astype(np.float32) * same for h in (STIFF, SOFT)
-        ]
-        coarse, fine = SEARCH_STEPS
-        rough = cubic_grid(self._unit * np.arange(-SEARCH, SEARCH + 1e-6, coarse, dtype=np.float32))
-        self._rough = rough[np.linalg.norm(rough, axis=1) < (SEARCH + 1e-3) * self._unit]
-        self._fine = cubic_grid(self._unit * np.arange(-fine, fine + 1e-6, fine, dtype=np.float32))
+        )
 
     def _expected(self, members: NDArray[np.int64], trajectories: list[Trajectory]) -> Floats | None:
         """(T, 3) centers of a part by the trajectory that passes it at the key time; None where none does."""
         center = self.positions[members].mean(axis=0)
         radius = float(np.linalg.norm(self.positions[members] - center, axis=1).max())
-        for trajectory in trajectories:
-            offset = center - trajectory.centers[self._key]
-            seen = trajectory.seen[max(0, self._key - 1) : self._key + 2].any()
-            if seen and np.linalg.norm(offset) < max(radius, self._unit):
-                return trajectory.centers + offset
+        for centers, seen in trajectories:
+            offset = center - centers[self._key]
+            if seen[max(0, self._key - 1) : self._key + 2].any() and np.linalg.norm(offset) < max(radius, self._unit):
+                return centers + offset
         return None
 
     def follow(self) -> Floats:
@@ -102,31 +95,29 @@ class Follower:
             centers = paths[:, part.members].mean(axis=1)
             ways = np.linalg.norm(np.diff(centers, axis=0), axis=1)
             part.speed = float(ways.mean())
-            if np.abs(centers[-1]).max() > self._clouds.half_side:  # it has left the box
-                continue
-            step = at @ np.linalg.lstsq(basis, centers, rcond=None)[0] - centers[-1]
-            longest = 1.5 * float(ways.max())
-            positions[part.members] += step * min(1.0, longest / max(float(np.linalg.norm(step)), 1e-9))
+            if np.abs(centers[-1]).max() <= self._clouds.half_side:  # it has not left the box
+                step = at @ np.linalg.lstsq(basis, centers, rcond=None)[0] - centers[-1]
+                longest = 1.5 * float(ways.max())
+                positions[part.members] += step * min(1.0, longest / max(float(np.linalg.norm(step)), 1e-9))
         return positions
 
     def _register(self, positions: Floats, i: int) -> Floats:
         """Positions (n, 3) of the tracks' points among the points of time i, from a prediction, which is changed, and
         from where the parts' centers are expected."""
-        points = self._clouds.clouds[i].thinned(DATA)
+        points = self._clouds.clouds[i].thinned(160)
         if len(points.scores) == 0:
             return positions
         free = np.ones(len(points.scores), np.float32)
         for part in self._parts:
             free *= 1.0 - 0.9 * self._search(part, positions, points, free, i)
         data, weights = points.positions, points.scores[:, None]
-        alike = 0.2 + 0.8 * np.exp(-_sq_distances(points.colors, self.colors) / (2 * COLOR_SPREAD**2))
-        for step in range(ROUNDS):
-            share = step / (ROUNDS - 1)
+        alike = 0.2 + 0.8 * np.exp(-_sq_distances(points.colors, self.colors) / (2 * 0.3**2))
+        for share in (0.0, 0.25, 0.5, 0.75, 1.0):
             spread = self._unit * WIDE ** (1 - share) * NARROW**share
             belongs = alike * np.exp(-_sq_distances(data, positions) / (2 * spread**2))
             belongs *= weights / (belongs.sum(axis=1, keepdims=True) + NOISE)
             mass = belongs.sum(axis=0)[:, None]
-            kernel = self._kernels[0] if share < 0.6 else self._kernels[1]
+            kernel = self._stiff if share < 0.6 else self._soft
             positions = positions + (kernel @ (belongs.T @ data - mass * positions)) / (kernel @ mass + 1e-2)
         return positions
 
@@ -139,18 +130,29 @@ class Follower:
         if part.expected is not None:
             starts.append(part.expected[i] - positions[part.members].mean(axis=0))
         reaches, spreads = np.array([reach, 1.0], np.float32), np.array([widening, 1.0]) * PRIOR * self._unit
+        some = part.members[evenly_indices(len(part.members), 24)]
+        pairs = 0.3 + 0.7 * np.exp(-_sq_distances(points.colors, self.colors[some]) / (2 * 0.35**2))
 
-        def prior(shifts: Floats) -> NDArray[np.float64]:
-            pairs = zip(starts, spreads, strict=False)
-            return np.max([np.exp(-((shifts - at) ** 2).sum(axis=1) / (2 * spread**2)) for at, spread in pairs], axis=0)
+        def explained(shifts: Floats, spread: float) -> tuple[Floats, NDArray[np.float64], Floats]:
+            """(s,) how much of the points the part explains when it is moved by each of the shifts (s, 3), (s,) how
+            likely these are, and (s, m) how near it then is to each of the points. spread: standard deviation, UNIT."""
+            moved = (points.positions.T[:, None] - shifts.T[:, :, None]).reshape(3, -1)
+            nearest, squared = _nearest(moved, positions[some])
+            near = np.exp(-squared / (2 * (spread * self._unit) ** 2)).reshape(len(shifts), -1)
+            alike = pairs[np.arange(len(points.colors)), nearest.reshape(near.shape)]
+            around = zip(starts, spreads, strict=False)
+            prior = [np.exp(-((shifts - at) ** 2).sum(axis=1) / (2 * width**2)) for at, width in around]
+            return (near * alike * free * points.scores).sum(axis=1), np.max(prior, axis=0), near
 
-        shifts = np.concatenate([start + scale * self._rough for start, scale in zip(starts, reaches, strict=False)])
-        rough, _ = self._explained(part, positions, points, free, shifts, SEARCH_SPREADS[0])
-        chosen = np.argsort(-rough * prior(shifts), kind="stable")[:CANDIDATES]
-        scale = reaches[chosen // len(self._rough)][:, None, None]
-        shifts = (shifts[chosen][:, None] + scale * self._fine).reshape(-1, 3)
-        scores, near = self._explained(part, positions, points, free, shifts, SEARCH_SPREADS[1])
-        best = int((scores * prior(shifts)).argmax())
+        rough: NDArray[Any] = self._unit * ROUGH
+        fine: NDArray[Any] = self._unit * FINE
+        shifts = np.concatenate([start + scale * rough for start, scale in zip(starts, reaches, strict=False)])
+        scores, likely, _ = explained(shifts, 0.9)
+        chosen = np.argsort(-scores * likely, kind="stable")[:4]
+        scale = reaches[chosen // len(rough)][:, None, None]
+        shifts = (shifts[chosen][:, None] + scale * fine).reshape(-1, 3)
+        scores, likely, near = explained(shifts, 0.5)
+        best = int((scores * likely).argmax())
         if part.usual and scores[best] < LOST * np.median(part.usual):
             part.lost += 1
             positions[part.members] += starts[-1]
@@ -159,19 +161,6 @@ class Follower:
         part.lost = 0
         positions[part.members] += shifts[best]
         return near[best]
-
-    def _explained(
-        self, part: _Part, positions: Floats, points: Points, free: Floats, shifts: Floats, spread: float
-    ) -> tuple[Floats, Floats]:
-        """(s,) how much of the points a part explains when it is moved by each of the shifts (s, 3), and (s, m) how
-        near it then is to each of the points."""
-        some = part.members[evenly_indices(len(part.members), 24)]
-        moved = (points.positions.T[:, None] - shifts.T[:, :, None]).reshape(3, -1)
-        nearest, squared = _nearest(moved, positions[some])
-        near = np.exp(-squared / (2 * (spread * self._unit) ** 2)).reshape(len(shifts), -1)
-        pairs = 0.3 + 0.7 * np.exp(-_sq_distances(points.colors, self.colors[some]) / (2 * 0.35**2))
-        alike = pairs[np.arange(len(points.colors)), nearest.reshape(near.shape)]
-        return (near * alike * free * points.scores).sum(axis=1), near
 
 
 def _nearest(a: Floats, b: Floats) -> tuple[NDArray[np.uint8], Floats]:

@@ -16,7 +16,6 @@ Mask = NDArray[np.bool_]
 
 FALLOFF = 1.5  # pixels; standard deviation of the mask's soft border
 BLUR = 2.0  # pixels; standard deviation of the colors that views are compared by
-PARTLY = 0.3  # share of a thing that masks tell, from which on it is a mover
 
 
 def cubic_grid(axis: NDArray[Any]) -> NDArray[Any]:
@@ -37,7 +36,7 @@ class Residual:
         if moving is not None:  # masks from flow lack legs that are too fast for it
             labels, count = ndimage.label(ndimage.binary_fill_holes(self.mask))
             told = ndimage.mean(moving, labels, np.arange(count) + 1)
-            self.mask = moving | np.isin(labels, 1 + np.flatnonzero(told > PARTLY))
+            self.mask = moving | np.isin(labels, 1 + np.flatnonzero(told > 0.3))
 
     @cached_property
     def _soft(self) -> Floats:

@@ -13,14 +13,13 @@ from torch import Tensor, nn
 
 from lapgs_wgpu.discovery.residual import Floats, Residual
 from lapgs_wgpu.discovery.tracks import Tracks, all_of, parabolas
-from lapgs_wgpu.discovery.turns import harmonics, part_radius
+from lapgs_wgpu.discovery.turns import harmonics
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.linear_light import directions
 from lapgs_wgpu.splat.rasterize import rasterize
 
 POINTS = 300  # of a body
 SPACING = 0.5  # standard deviation of a Gaussian in distances of a body's points, at first
-OPACITY = 3.0  # logit, at first
 STEPS = 800
 RATES = {"points": 2e-3, "colors": 2e-2, "sizes": 1e-2, "opacities": 3e-2, "light": 5e-3, "turns": 1e-2, "shifts": 1e-3}
 LAST = 0.05  # of these rates, in the end; they fall over the second half
@@ -44,7 +43,7 @@ def rigid_tracks(
     Other parts are drawn, too, as they are, and so stay those of which too little of the images is explained.
     """
     parts = list(rotations)
-    radii = torch.tensor([part_radius(tracks, k) for k in parts])
+    radii = torch.tensor([tracks.radius(k) for k in parts])
     others = ~np.isin(stands[tracks.part], parts)
     R0 = torch.from_numpy(np.stack([rotations[k] for k in parts], axis=1)).float()
     centers = torch.from_numpy(np.stack([tracks.center(k) for k in parts], axis=1))
@@ -52,12 +51,13 @@ def rigid_tracks(
     count = len(parts) * POINTS
     size = torch.log(SPACING * (4 * np.pi / POINTS) ** 0.5 * radii).repeat_interleave(POINTS)
     soft_size = torch.full((len(soft_colors),), float(size.mean()))
+    quats = torch.tensor([1.0, 0, 0, 0]).repeat(count + len(soft_size), 1)
     around = {name: torch.from_numpy(parabolas(times, 1.0, spread)).float() for name, spread in SPREADS.items()}
     values = {
         "points": torch.from_numpy(directions(POINTS)).float() * radii[:, None, None],
         "colors": torch.cat([torch.full((count, 3), 0.4), soft_colors]),
         "sizes": torch.cat([size, soft_size]),
-        "opacities": torch.full((count + len(soft_size),), OPACITY),
+        "opacities": torch.full((count + len(soft_size),), 3.0),
         "light": torch.eye(9)[0].repeat(len(parts), 1),
         "turns": torch.zeros(len(times), len(parts), 3),
         "shifts": torch.zeros(len(times), len(parts), 3),
@@ -87,17 +87,9 @@ def rigid_tracks(
         R, center = poses(at)
         arms = values["points"] @ R.transpose(1, 2)
         means = torch.cat([(arms + center[:, None]).reshape(-1, 3), soft_paths[at]])
-        drawn = rasterize(
-            means,
-            torch.tensor([1.0, 0, 0, 0]).repeat(len(means), 1),
-            values["sizes"].exp()[:, None].repeat(1, 3),
-            values["opacities"].sigmoid(),
-            values["colors"] * torch.cat([light_on(arms).reshape(-1, 1), torch.ones(len(soft_size), 1)]),
-            image.camera,
-            antialiased=True,
-            depth=False,
-            device=device,
-        )
+        lit = torch.cat([light_on(arms).reshape(-1, 1), torch.ones(len(soft_size), 1)])
+        shapes = means, quats, values["sizes"].exp()[:, None].repeat(1, 3), values["opacities"].sigmoid()
+        drawn = rasterize(*shapes, values["colors"] * lit, image.camera, antialiased=True, depth=False, device=device)
         picture = drawn.image + (1 - drawn.alpha)[..., None] * torch.from_numpy(image.still)
         difference = (picture - torch.from_numpy(image.image)).abs()
         optimizer.zero_grad()

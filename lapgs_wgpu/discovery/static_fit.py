@@ -20,8 +20,6 @@ from lapgs_wgpu.train.exposure import without_exposure
 from lapgs_wgpu.train.trainer import Trainer
 
 MOST_VIEWS = 400  # of a capture, evenly chosen over the clip
-RIM = 2  # pixels around what moves that the fit does not look at, either
-SOLID = 0.5  # alpha from which on something is there
 # The schedule, in shares of its steps, and the rates are its own: what the static fit is sure of decides what is found.
 SCHEDULE = {
     "schedule.sh_interval": 0.375,
@@ -32,7 +30,7 @@ SCHEDULE = {
     "density.reset_interval": 1.0,
 }
 REFINE = 0.125  # from when on cameras move, at the latest
-# The learning rates are those of 3DGS; of the losses, L1 and SSIM are left.
+# The learning rates are those of 3DGS; of the losses, L1 and SSIM are left: a warm-up, which it all is, has no others.
 VALUES = {
     "field.kind": "static",
     "rates.log_scales": 5e-3,
@@ -42,11 +40,7 @@ VALUES = {
     "density.gradient": 5e-4,
     "density.split": "plain",
     "loss.pyramid": 0.0,
-    "loss.ncc": 0.0,
-    "loss.dynamics": 0.0,
     "schedule.cool_down": 0.0,
-    "smoothness.share": 0.0,
-    "acceleration.weight": 0.0,
     "step_place": "auto",
 }
 
@@ -114,13 +108,13 @@ def depth_of(scene: Scene4D, camera: Camera) -> Floats:
         of_each = still.means, still.quats, still.scales, still.opacities, colors
         drawn = rasterize(*of_each, camera, antialiased=still.antialiased, device=scene.device)
     alpha, total = drawn.alpha.numpy(force=True), drawn.image[..., 0].numpy(force=True)
-    return np.where(alpha > SOLID, alpha / np.maximum(total, 1e-9), np.nan).astype(np.float32)
+    return np.where(alpha > 0.5, alpha / np.maximum(total, 1e-9), np.nan).astype(np.float32)
 
 
 def _without_movers(view: View) -> View:
-    """The view, whose moving pixels the loss leaves out."""
+    """The view, whose moving pixels the loss leaves out, and two around them."""
     if view.moving is None:
         return view
-    moving = ndimage.binary_dilation(view.moving(), iterations=RIM)
+    moving = ndimage.binary_dilation(view.moving(), iterations=2)
     ignored = view.load_ignored()
     return dataclasses.replace(view, ignored=lambda: moving if ignored is None else moving | ignored)

@@ -4,6 +4,9 @@ Cameras of neighbouring times see a moving object from other sides while it has 
 space. Where cameras move slowly, they meet at a depth that the object's own motion feigns. Such votes are blurred along
 the ray, until the middle of the scene is as good a place as any. Places that differ at all times hold texture that the
 static fit blurs. They get no points.
+
+Between cameras all around, points of the visual hull (Laurentini, PAMI 1994): where nearly all cameras that see a place
+show what they usually do not.
 """
 
 from collections.abc import Iterable, Sequence
@@ -16,23 +19,30 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from lapgs_wgpu.data.evenly import evenly_indices
-from lapgs_wgpu.discovery.residual import Floats, Residual, cubic_grid
+from lapgs_wgpu.data.evenly import evenly, evenly_indices
+from lapgs_wgpu.data.plane_sweep import IMAGES
+from lapgs_wgpu.data.views import AROUND, Dataset, View, composite, small_views
+from lapgs_wgpu.discovery.residual import Floats, Mask, Residual, cubic_grid
+from lapgs_wgpu.progress import counted
 
-RAYS = 300  # of an image, at most
 DEPTHS = 64  # that are tried along a ray
-NEIGHBORS = 6  # images that vote on a depth, those nearest in time
 COLOR_SPREAD = 0.25  # standard deviation of the colors of one surface in several images
 COLOR_SHARE = 0.7  # of a vote that depends on the color
 GRID = 48  # cells along an axis of the grid of what is residual at all times
 ALWAYS, ALWAYS_WIDTH = 0.8, 0.25  # share of all images, above which a residual is no motion; width of the transition
-LEAST_SCORE = 0.5  # of a point
 PLATEAU = 0.1  # scores within this share of the best one count as equal; their middle is taken
 # In half sides of the box, 1.3 in the presets:
 MOTION = 0.05  # way from one time to the next that a depth must allow for
 MIDDLE = 2.0  # standard deviation of depths around that of the middle of the scene
 LONELY = 0.12  # a point is dropped whose fourth neighbour is further
 LINK = 0.11  # points closer than this are of one part
+TINT = 1.0  # `PointClouds.tint` between cameras all around: hands that hold a ball are not of one color with it
+# Of the visual hull:
+CELLS = 96  # along each axis of the cube
+DIFFERENT = 20.0  # levels of 255; mean of channels and neighboring pixels, from which on a pixel differs
+AGREEING = 0.9  # share of the cameras that see a place, in which it differs
+POINTS = 1500  # of a time, at most
+BLACK = 0.0, 0.0, 0.0
 
 
 class Points(NamedTuple):
@@ -57,11 +67,8 @@ def merged(parts: Iterable[Points]) -> Points:
 
 
 class PointClouds(NamedTuple):
-    """The surface points of all times (T,), ascending, and the cloud of each, within [-half_side, half_side]^3.
-
-    tint: how far apart points of one place are that differ by 1 in color, world units, where their colors tell things
-    that touch.
-    """
+    """The surface points of all times (T,), ascending, and the cloud of each, within [-half_side, half_side]^3. tint:
+    how far apart, world units, points of one place are that differ by 1 in color, where that tells what touches."""
 
     times: NDArray[np.float64]
     clouds: tuple[Points, ...]
@@ -94,18 +101,21 @@ def surface_points(images: Sequence[Residual], half_side: float) -> PointClouds:
     found: list[list[Points]] = [[] for _ in times]
     for i, image in enumerate(images):
         lapses = np.abs(taken - image.time) / step
-        nearest = [n for n in np.argsort(lapses, kind="stable") if n != i][:NEIGHBORS]
+        nearest = [n for n in np.argsort(lapses, kind="stable") if n != i][:6]
         neighbors = [(images[n], float(lapses[n])) for n in nearest]
         found[np.searchsorted(times, image.time)].append(_points(image, neighbors, always, half_side))
-    return PointClouds(times, tuple(_dense(merged(each), half_side) for each in found), half_side)
+    clouds = []
+    for points in map(merged, found):
+        distances, _ = cKDTree(points.positions).query(points.positions, k=5)
+        clouds.append(points.chosen(distances[:, 4] < LONELY * half_side))
+    return PointClouds(times, tuple(clouds), half_side)
 
 
 def _points(image: Residual, neighbors: list[tuple[Residual, float]], always: Floats, half_side: float) -> Points:
     """neighbors: images and how many time steps they are apart. always: of `_always`."""
-    directions, blurred, colors = image.rays(RAYS)
-    if len(directions) == 0 or not neighbors:
-        empty = np.zeros((0, 3), np.float32)
-        return Points(empty, empty, np.zeros(0, np.float32))
+    directions, blurred, colors = image.rays(300)
+    if not len(directions):
+        return Points(directions, colors, directions[:, 0])
     eye = image.camera.position.astype(np.float32)
     depths = _depths(eye, directions, half_side)
     places = eye + depths[..., None] * directions[:, None]
@@ -140,7 +150,7 @@ def _points(image: Residual, neighbors: list[tuple[Residual, float]], always: Fl
     depth = depths[np.arange(len(scores)), low] + (middle - low) * (depths[:, 1] - depths[:, 0])
     positions = eye + depth[:, None] * directions
     best = scores.max(axis=1)
-    return Points(positions.astype(np.float32), colors, best.astype(np.float32)).chosen(best > LEAST_SCORE)
+    return Points(positions.astype(np.float32), colors, best.astype(np.float32)).chosen(best > 0.5)
 
 
 def _depths(eye: Floats, directions: Floats, half_side: float) -> Floats:
@@ -162,12 +172,6 @@ def _middle_of_best(scores: NDArray[np.floating]) -> NDArray[np.float64]:
     return 0.5 * (first + last)
 
 
-def _dense(points: Points, half_side: float) -> Points:
-    """The points without isolated ones."""
-    distances, _ = cKDTree(points.positions).query(points.positions, k=5)
-    return points.chosen(distances[:, 4] < LONELY * half_side)
-
-
 def _always(images: Sequence[Residual], half_side: float) -> Floats:
     """(GRID, GRID, GRID) the share of images in which a place of the box is residual."""
     places = cubic_grid(((np.arange(GRID, dtype=np.float32) + 0.5) / GRID * 2 - 1) * half_side).astype(np.float32)
@@ -177,3 +181,54 @@ def _always(images: Sequence[Residual], half_side: float) -> Floats:
         total += mask
         count += inside
     return np.divide(total, np.maximum(count, 1.0), dtype=np.float32).reshape(GRID, GRID, GRID)
+
+
+def hull_points(dataset: Dataset, half_side: float) -> PointClouds:
+    """Points of what moves within [-half_side, half_side]^3, for each time of a rig's clip. Raises InputError where an
+    image cannot be read."""
+    places = cubic_grid((np.arange(CELLS) + 0.5) / CELLS * 2 * half_side - half_side)
+    cameras = [
+        _still_camera([view for view in dataset.train if view.camera is camera], places) for camera in dataset.cameras
+    ]
+    clouds = []
+    for time in counted(dataset.times, len(dataset.times), "times searched for what moves"):
+        seeing, agreeing = np.zeros((2, len(places)), np.int32)
+        shown = []
+        for views, usual, pixel in cameras:
+            if (view := views.get(float(time))) is None:
+                continue
+            image = composite(view.load(), BLACK)
+            differs = ndimage.uniform_filter(np.abs(image - usual).mean(axis=2), 3) > DIFFERENT
+            if differs.mean() > 0.5:  # not what moves, but its exposure
+                continue
+            shown.append((image, differs, pixel))
+            seeing += pixel >= 0
+            agreeing += _at(ndimage.binary_dilation(differs), pixel)
+        there = np.flatnonzero((seeing >= AROUND) & (agreeing >= AGREEING * seeing))
+        there = there[evenly_indices(len(there), POINTS)]
+        colors = np.full((len(shown), len(there), 3), np.nan, np.float32)
+        for color, (image, differs, pixel) in zip(colors, shown, strict=True):
+            shows = _at(differs, pixel[there])
+            color[shows] = image.reshape(-1, 3)[pixel[there[shows]]] / 255
+        known = np.isfinite(colors).any(axis=(0, 2))
+        color = np.nanmedian(colors[:, known], axis=0)  # in some cameras something else is before it
+        clouds.append(Points(places[there[known]].astype(np.float32), color, np.ones(len(color), np.float32)))
+    return PointClouds(dataset.times, tuple(clouds), half_side, TINT * half_side)
+
+
+def _still_camera(
+    views: list[View], places: NDArray[np.float32]
+) -> tuple[dict[float, View], NDArray[np.float32], NDArray[np.int32]]:
+    """Small views, by time; their usual image (h, w, 3); and the pixel (n,) that shows each place, -1 where none."""
+    small = sorted(small_views(views, 160), key=lambda view: view.time)
+    usual = np.median([composite(view.load(), BLACK) for view in evenly(small, IMAGES)], axis=0).astype(np.float32)
+    camera = small[0].camera
+    pixels, depths = camera.project(places)
+    inside = (depths > 1e-9) & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
+    column, row = np.where(inside[:, None], pixels, 0).astype(np.int32).T
+    return {view.time: view for view in small}, usual, np.where(inside, row * camera.width + column, -1)
+
+
+def _at(mask: Mask, pixel: NDArray[np.int32]) -> Mask:
+    """(n,) the mask at pixels (n,), False where these are -1."""
+    return np.append(mask.ravel(), False)[pixel]

@@ -18,26 +18,20 @@ from lapgs_wgpu.discovery.residual import Floats
 from lapgs_wgpu.discovery.surface_points import PointClouds, Points, merged
 from lapgs_wgpu.discovery.trajectories import Trajectory, find_trajectories
 
-KEY_TIMES = 4  # from which is tracked, at most
-LEAST_REST = 0.05  # share of the points without a track that is worth another key time
-ROUGH, FINE = 150, 300  # points of a key time: when first followed, and with the points of all times brought there
-MANY = (0.5, 0.75)  # quantiles, over the times, of how many parts are apart; each gives key times of its own
-PROBES = 300  # points of a time by which parts are counted, at most
 # In half sides of the box, 1.3 in the presets:
 VOXEL = 0.045  # spacing of a track's points
 REACH = 0.07  # distance within which a track explains a point
 FOLLOWED = 0.5  # of all points, how close tracks come that are good enough
 CLOSE = 0.03  # standard deviation of the distance from a track, by which two sets of tracks are compared
 CALM = 0.02  # jitter of a part's center that is no leaping
-LEAST_SEEN = 0.4  # share of the times at which a part must be seen
-LEAST_VISIT = 0.2  # the same of a part that comes, stays and goes once
-LEAPS = 1.7  # jitter of a part's center that is leaping, in steps of its smoothed path
-LEAP_SIZE = 0.28  # and in sizes of the part
+LEAST_SEEN, LEAST_VISIT = 0.4, 0.2  # share of the times at which a part must be seen; that comes, stays and goes once
+LEAPS, LEAP_SIZE = (
+    1.7,
+    0.28,
+)  # jitter of a center that is leaping, in steps of its smoothed path and in sizes of its part
 EVEN = 0.35  # variation of the number of points that a part explains, relative to their mean, of one thing
 EXPLAINED = 0.3  # weight of points that an earlier key time's tracks explain
 SMOOTHING = 2.0  # times; standard deviation of the weights by which paths are smoothed
-RIDGE = 1e-2  # of slope and curvature, which few times do not determine
-UNSUPPORTED = 0.1  # weight of a time at which a part is not seen
 SUPPORTED = 0.3  # share of a part's points with surface points within REACH, from which on it is seen
 
 
@@ -63,6 +57,11 @@ class Tracks(NamedTuple):
         """(T, 3) the mean of the points of part k."""
         return self.paths[:, self.part == k].mean(axis=1)
 
+    def radius(self, k: int) -> float:
+        """Of the ball around part k."""
+        arms = self.paths[:, self.part == k] - self.center(k)[:, None]
+        return float(np.quantile(np.linalg.norm(arms, axis=2), 0.9))
+
     def of_parts(self, kept: NDArray[np.bool_]) -> "Tracks | None":
         """The tracks of the parts (p,) that are set, and numbered anew; None where there are none."""
         chosen = kept[self.part]
@@ -86,12 +85,11 @@ def find_tracks(clouds: PointClouds) -> Tracks | None:
     """Tracks of the surface points of a clip; None where nothing can be followed.
 
     Many parts are apart where things part, and also where one thing falls to patches. Which it is shows in how close
-    to all points the tracks come that start there. Where that is far from all, trajectories that share groups may do
-    better.
+    to all points the tracks come that start there. Where that is far, trajectories that share groups may do better.
     """
     closest, best = 0.0, None
     for trajectories in find_trajectories(clouds):
-        for many in MANY:
+        for many in (0.5, 0.75):
             if (tracks := _tracks_by(many, clouds, trajectories)) is None:
                 continue
             apart = [distances / (CLOSE * clouds.half_side) for distances, _ in clouds.nearest(tracks.paths)]
@@ -106,10 +104,10 @@ def _tracks_by(many: float, clouds: PointClouds, trajectories: list[Trajectory])
     """The tracks from key times at which as many parts are apart as this quantile of all times has."""
     free = [np.ones(len(cloud.scores), bool) for cloud in clouds.clouds]
     found: list[Tracks] = []
-    for _ in range(KEY_TIMES):
+    for _ in range(4):
         rest = [cloud.chosen(mask) for cloud, mask in zip(clouds.clouds, free, strict=True)]
         key = _key_time(rest, many, clouds)
-        if sum(len(points.scores) for points in rest) < LEAST_REST * clouds.total or key is None:
+        if sum(len(points.scores) for points in rest) < 0.05 * clouds.total or key is None:
             break
         weighted = tuple(
             points._replace(scores=points.scores * np.where(mask, 1.0, EXPLAINED).astype(np.float32))
@@ -123,14 +121,13 @@ def _tracks_by(many: float, clouds: PointClouds, trajectories: list[Trajectory])
         explained = np.stack([np.bincount(tracks.part[of[near]], minlength=tracks.parts) for near, of in reached])
         if (steady := tracks.of_parts(_steady(tracks, paths, explained, clouds.half_side))) is not None:
             found.append(steady._replace(part=steady.part + (found[-1].parts if found else 0)))
-        for mask, (near, _) in zip(free, reached, strict=True):
-            mask &= ~near
+        free = [mask & ~near for mask, (near, _) in zip(free, reached, strict=True)]
     return all_of(found) if found else None
 
 
 def _key_time(rest: list[Points], many: float, clouds: PointClouds) -> int | None:
     """The time of most of the points that are left among those at which many parts are apart."""
-    some = [points.thinned(PROBES) for points in rest]
+    some = [points.thinned(300) for points in rest]
     parts = np.array([(np.bincount(clouds.parts(_around(some, i))) >= LEAST_PART).sum() for i in range(len(some))])
     if not parts.any():
         return None
@@ -160,12 +157,10 @@ def _voxels(points: Points, size: float, least: int) -> Points:
 def _tracks_from(
     key: int, start: Points, clouds: PointClouds, trajectories: list[Trajectory]
 ) -> tuple[Tracks, Floats] | None:
-    """The points of a key time, followed twice: first those of that time, then with all that belongs to them.
-
-    Returns the tracks, and their paths before these were smoothed, which are nearer to the points of each time.
-    """
+    """The points of a key time, followed twice: first those of that time, then with all that belongs to them; and their
+    paths before these were smoothed, which are nearer to the points of each time."""
     found = None
-    for most, least in (ROUGH, 1), (FINE, 3):
+    for most, least in (150, 1), (300, 3):
         if found is not None:
             start = _at_key_time(key, found[0].paths, clouds)
         follower = Follower(_voxels(start, VOXEL * clouds.half_side, least).thinned(most), key, clouds, trajectories)
@@ -180,7 +175,7 @@ def _tracks_from(
             seen = near[:, members].mean(axis=1) > SUPPORTED
             supported[:, members] = seen[:, None]
             # The image of a time shows one side of a part, and pulls it towards that side.
-            fitted = parabolas(clouds.times, np.where(seen, 1.0, UNSUPPORTED), SMOOTHING)
+            fitted = parabolas(clouds.times, np.where(seen, 1.0, 0.1), SMOOTHING)
             smooth[:, members] = np.tensordot(fitted, paths[:, members], axes=1)
         found = Tracks(follower.positions, follower.colors, follower.part, smooth, supported), paths
     return found
@@ -205,12 +200,11 @@ def _steady(tracks: Tracks, paths: Floats, explained: NDArray[np.int64], half_si
     """
     steady = np.zeros(tracks.parts, bool)
     for k in range(len(steady)):
-        members = tracks.part == k
+        members, center = tracks.part == k, tracks.center(k)
         seen = tracks.supported[:, members][:, 0]
         visits = np.count_nonzero(np.diff(seen, prepend=False) & seen)
         if seen.mean() < (LEAST_VISIT if visits == 1 else LEAST_SEEN):
             continue
-        center = tracks.center(k)
         jitter = np.linalg.norm(paths[:, members].mean(axis=1) - center, axis=1)[seen].mean()
         steps = np.linalg.norm(np.diff(center, axis=0), axis=1)[seen[1:] & seen[:-1]]
         step = np.median(steps) if len(steps) else 0.0
@@ -229,4 +223,5 @@ def parabolas(times: NDArray[np.float64], weights: NDArray[np.float64] | float, 
     lapses = (clock - clock[:, None]) / spread
     basis = np.stack([np.ones_like(lapses), lapses, lapses**2], axis=2)
     weighted = np.swapaxes(basis, 1, 2) * (np.exp(-0.5 * lapses**2) * weights)[:, None]
-    return np.linalg.solve(weighted @ basis + np.diag([0.0, RIDGE, RIDGE]), weighted)[:, 0]
+    ridge = np.diag([0.0, 1e-2, 1e-2])  # of slope and curvature, which few times do not determine
+    return np.linalg.solve(weighted @ basis + ridge, weighted)[:, 0]

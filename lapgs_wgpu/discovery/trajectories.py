@@ -20,15 +20,12 @@ from lapgs_wgpu.data.timestamps import time_step
 from lapgs_wgpu.discovery.residual import Floats
 from lapgs_wgpu.discovery.surface_points import PointClouds
 
-LEAST_GROUP = 6  # points
-FULL_GROUP = 20  # points, from which on a group counts in full
+LEAST_GROUP, FULL_GROUP = 6, 20  # points of a group, and from which on it counts in full
 LEAP = 6  # time steps from one group of a path to the next, at most
 SKIPPED = 0.1  # cost of a time that a path leaps over; a group on it is worth 1
 AGAIN = 0.1  # worth of a group that is on an earlier path
 LEAST_WORTH = 8.0  # of a path
-MOST = 8  # paths
 COLOR_SPREAD = 0.15
-AT_ONCE = 0.75  # quantile, over the times, of the number of groups: so many paths are given groups one to one
 SHARP = 2.0  # highest cost of a bend, and of a change of color
 WINDOW = 1.0  # time steps; standard deviation of the weights by which a path is smoothed
 # In half sides of the box:
@@ -63,13 +60,13 @@ def find_trajectories(clouds: PointClouds) -> list[list[Trajectory]]:
     found, where that differs."""
     groups = _groups(clouds)
     paths: list[list[int]] = []
-    while len(paths) < MOST:
+    while len(paths) < 8:
         path, worth = _best_path(groups)
         if worth < LEAST_WORTH:
             break
         groups.worth[path] *= AGAIN
         paths.append(path)
-    at_once = int(np.quantile(np.bincount(groups.time, minlength=len(groups.clock)), AT_ONCE))
+    at_once = int(np.quantile(np.bincount(groups.time, minlength=len(groups.clock)), 0.75))
     given = _one_to_one(groups, paths[:at_once]) + paths[at_once:]
 
     def trajectory(path: list[int]) -> Trajectory:
@@ -84,9 +81,8 @@ def _groups(clouds: PointClouds) -> _Groups:
     for i, points in enumerate(clouds.clouds):
         part = clouds.parts(points)
         for k in np.flatnonzero(np.bincount(part, minlength=1) >= LEAST_GROUP):
-            members = part == k
-            center, color = points.positions[members].mean(axis=0), points.colors[members].mean(axis=0)
-            rows.append([i, *center, *color, min(1.0, members.sum() / FULL_GROUP)])
+            positions, colors, scores = points.chosen(part == k)
+            rows.append([i, *positions.mean(axis=0), *colors.mean(axis=0), min(1.0, len(scores) / FULL_GROUP)])
     table = np.array(rows, np.float64).reshape(-1, 8)
     of_groups = table[:, 0].astype(np.int64), table[:, 1:4], table[:, 4:7], table[:, 7].copy()
     return _Groups(clouds.times / time_step(clouds.times), clouds.half_side, *of_groups)
@@ -188,9 +184,7 @@ def _change(groups: _Groups, before: list[int], after: list[int]) -> float:
 
 def _smooth(groups: _Groups, path: list[int], *, alone: bool = False, bent: bool = False) -> Floats:
     """(T, 3) the path at every time: a straight line fitted to the groups around it, by weights that fall off in time.
-
-    alone: whether by those of other times alone. bent: whether a parabola where it leaps over times, in which what
-    circles turns."""
+    alone: to those of other times. bent: a parabola where it leaps over times, in which what circles turns."""
     centers = groups.centers[path]
     lapses = groups.clock[groups.time[path]] - groups.clock[:, None]
     counted = (lapses != 0) | (not alone)

@@ -6,7 +6,7 @@ there outwards, each time turns as its image fits best what is known of the ball
 then each is fitted once more to what all others show. `rigid_fit` makes it exact.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,20 +21,12 @@ from lapgs_wgpu.discovery.tracks import Tracks, parabolas
 
 Doubles = NDArray[np.float64]
 
-PIXELS = 2000  # of an image, at most
-SAMPLES = 150  # of a part in an image, at most
-LEAST_SAMPLES = 10
-LEAST_TIMES = 12  # at which a part is seen
-ROUND = 0.9  # quantile of the distances of a part's points from its center that is the radius of the ball
+PIXELS, SAMPLES = 2000, 150  # of an image, and of a part in it, at most
+LEAST_SAMPLES, LEAST_TIMES = 10, 12  # of a part in an image, and at which it is seen
 RIM = 0.9  # radii of the ball; beyond, pixels are mixed with what lies behind
 INSIDE = 0.75  # radii of the larger of two parts, within which the center of the other is of the same thing
 OVERLAP = 1.2  # radii of a part, within which pixels may show it
-OUTLINES = 2  # rounds in which balls are brought to the outlines of what moves
-UNSEEN = 1e-3  # weight of a time that shows no outline
-OUTLINE_SPREAD = 2.0  # time steps; of the weights by which these moves become smooth
 DARK = 0.2  # least light, of the mean brightness
-KEYS = 3  # times around which the turn is looked for
-WINDOW = 8.0  # time steps on either side
 FASTEST = 36.0  # degrees a time step
 # The searches, from rough to fine: degrees between turns, half of those before; time steps on either side over which
 # images are compared; and how many turns the next one looks around.
@@ -42,11 +34,10 @@ SEARCHES = (8.0, 3, 12), (4.0, 5, 4), (2.0, 8, 1)
 CELL, FINE = 0.18, 0.12  # radii; size of the places at which colors are compared, in the search and from there on
 SIDE = int(2 / FINE) + 3  # of these along an axis
 BLUR = 1.0  # FINE; standard deviation of the weights by which the colors around a place tell its color
-KEPT = 5  # time steps from the key time, up to which its turn is kept
 AROUND = (6.0, 2), (2.0, 2), (1.0, 1)  # degrees of a step and number of steps, of the search for the turn of a time
 AS_BEFORE = 36.0  # degrees beside the turn that goes on as before, that weigh as much as all differences of color
 MEMORY = 4  # times by which a turn goes on
-SPREAD = 6.0  # time steps; of the weights by which turns become smooth
+SPREAD, OUTLINE_SPREAD = 6.0, 2.0  # time steps; of the weights by which turns, and balls' moves, become smooth
 # Share of the colors' variance that is left without turns, which the turns of a part must explain: true ones 0.28 and
 # more, others 0.17 at most.
 GAIN = 0.22
@@ -59,15 +50,13 @@ class _Look(NamedTuple):
     colors: Floats
 
 
+def _joined(looks: Iterable[_Look]) -> _Look:
+    return _Look(*map(np.concatenate, zip(*looks, strict=True)))
+
+
 def harmonics(x: Any, y: Any, z: Any) -> list[Any]:
     """The 9 functions of unit vectors that make the light on a matt surface (Ramamoorthi and Hanrahan 2001)."""
     return [0 * x + 1, x, y, z, x * y, y * z, z * x, x * x - y * y, 3 * z * z - 1]
-
-
-def part_radius(tracks: Tracks, k: int) -> float:
-    """Radius of the ball around part k."""
-    paths = tracks.paths[:, tracks.part == k]
-    return float(np.quantile(np.linalg.norm(paths - paths.mean(axis=1, keepdims=True), axis=2), ROUND))
 
 
 def find_turns(
@@ -76,11 +65,11 @@ def find_turns(
     """(p,) which part stands for each, since several may be one thing; and by the number of each of these that turns
     its rotations (T, 3, 3) at the times (T,), from whatever orientation."""
     centers = [tracks.center(k) for k in range(tracks.parts)]
-    radii = np.array([part_radius(tracks, k) for k in range(len(centers))])
+    radii = np.array([tracks.radius(k) for k in range(len(centers))])
     stands = _one_of_each(centers, radii)
     things = np.unique(stands)
     middles, sizes = np.stack([centers[k] for k in things], axis=1), radii[things]
-    for _ in range(OUTLINES):
+    for _ in range(2):
         middles, sizes = _outlined(times, middles, sizes, images)
     clock, near = times / time_step(times), parabolas(times, 1.0, SPREAD)
     found = {}
@@ -88,11 +77,12 @@ def find_turns(
         looks = _looks(n, times, middles, sizes, images)
         if sum(len(look.places) > 0 for look in looks) < LEAST_TIMES:
             continue
+        looks = _unlit(looks)
         R = _smoothed(_turns(looks, clock), clock, near)
         known = sum(map(_known, looks, R), np.zeros(()))
         again = [_turn_of(look, each, known - _known(look, each)) for look, each in zip(looks, R, strict=True)]
         R = _smoothed(np.stack(again), clock, near)
-        places, colors = (np.concatenate(each) for each in zip(*looks, strict=True))
+        places, colors = _joined(looks)
         still = _explained(places, colors)
         turned = np.concatenate([look.places @ each for look, each in zip(looks, R, strict=True)])
         if _explained(turned, colors) - still >= GAIN * (1.0 - still):
@@ -115,7 +105,7 @@ def _one_of_each(centers: Sequence[Floats], radii: Doubles) -> NDArray[np.int64]
 def _outlined(times: Doubles, centers: Floats, radii: Doubles, images: Sequence[Residual]) -> tuple[Floats, Doubles]:
     """Centers (T, p, 3) and radii (p,) of parts as the outlines of what moves tell, of those that stand alone and whole
     in an image. Where several images show a time, the last one tells."""
-    shifts, seen = np.zeros(centers.shape), np.full(centers.shape[:2], UNSEEN)
+    shifts, weights = np.zeros(centers.shape), np.full(centers.shape[:2], 1e-3)
     sizes: list[list[float]] = [[] for _ in radii]
     for image in images:
         at, K, T = int(np.searchsorted(times, image.time)), image.camera.K, image.camera.T_cam_world
@@ -130,12 +120,12 @@ def _outlined(times: Doubles, centers: Floats, radii: Doubles, images: Sequence[
                 continue
             x, y = (np.array([columns, rows]) + 0.5).mean(axis=1) - middles[n]
             away = np.array([x / K[0, 0], y / K[1, 1], 0.0])
-            shifts[at, n], seen[at, n] = depths[n] * away @ T[:3, :3], 1.0
+            shifts[at, n], weights[at, n] = depths[n] * away @ T[:3, :3], 1.0
             sizes[n].append(float(np.sqrt(len(rows) / np.pi) * depths[n] / K[0, 0]))
     moved, found = centers.copy(), radii.copy()
     for n, each in enumerate(sizes):
         if len(each) >= LEAST_TIMES:
-            moved[:, n] += parabolas(times, seen[:, n], OUTLINE_SPREAD) @ shifts[:, n]
+            moved[:, n] += parabolas(times, weights[:, n], OUTLINE_SPREAD) @ shifts[:, n]
             found[n] = np.median(each)
     return moved, found
 
@@ -158,20 +148,18 @@ def _looks(k: int, times: Doubles, centers: Floats, radii: Doubles, images: Sequ
         chosen = chosen[evenly_indices(len(chosen), SAMPLES)]
         distances = along[chosen, k] - np.sqrt(radii[k] ** 2 - np.maximum(beside[chosen, k], 0.0))
         found[at].append(_Look((distances[:, None] * d[chosen] - to[k]) / radii[k], colors[chosen]))
-    return _unlit([_Look(*map(np.concatenate, zip(*each, strict=True))) for each in found])
+    return [_joined(each) for each in found]
 
 
 def _unlit(looks: list[_Look]) -> list[_Look]:
     """The colors without the light, which does not turn with a part."""
-    places, colors = (np.concatenate(each) for each in zip(*looks, strict=True))
+    places, colors = _joined(looks)
     basis, bright = np.stack(harmonics(*places.T), axis=1), colors.mean(axis=1)
     H = basis.T @ basis
     light = np.linalg.solve(H + 1e-3 * (np.trace(H) + 1) / 9 * np.eye(9), basis.T @ bright)
-    least = DARK * float(bright.mean()) if len(bright) else 1.0
-    return [
-        look._replace(colors=look.colors / np.maximum(np.stack(harmonics(*look.places.T), 1) @ light, least)[:, None])
-        for look in looks
-    ]
+    least = DARK * float(bright.mean())
+    lit = (np.maximum(np.stack(harmonics(*look.places.T), 1) @ light, least)[:, None] for look in looks)
+    return [look._replace(colors=look.colors / each) for look, each in zip(looks, lit, strict=True)]
 
 
 def _cells(places: Doubles, size: float) -> NDArray[np.int64]:
@@ -183,8 +171,6 @@ def _cells(places: Doubles, size: float) -> NDArray[np.int64]:
 def _explained(places: Doubles, colors: Floats, blocks: NDArray[np.int64] | int = 0) -> float:
     """Share of the variance of colors (n, 3) that places (n, 3) of size CELL explain, as if they were independent.
     blocks: (n,) from 0; only places of one block are compared."""
-    if len(colors) < 2:
-        return 0.0
     cells = _cells(places, CELL) + blocks * SIDE**3
     counts = np.bincount(cells)
     used = np.flatnonzero(counts)
@@ -196,10 +182,10 @@ def _explained(places: Doubles, colors: Floats, blocks: NDArray[np.int64] | int 
 
 def _turn_at(looks: list[_Look], clock: Doubles, key: int) -> tuple[Doubles, float]:
     """The turn (3,) a time step around a key time, a rotation vector, and how much more of the colors it explains than
-    no turn. clock: (T,) time steps."""
-    window = [i for i in np.flatnonzero(np.abs(clock - clock[key]) <= WINDOW) if len(looks[i].places)]
+    no turn. clock: (T,) time steps, of which eight on either side are looked at."""
+    window = [i for i in np.flatnonzero(np.abs(clock - clock[key]) <= 8) if len(looks[i].places)]
     lapses = clock[window] - clock[key]
-    places, colors = (np.concatenate([looks[i][n] for i in window]) for n in (0, 1))
+    places, colors = _joined(looks[i] for i in window)
     of = np.repeat(np.arange(len(window)), [len(looks[i].places) for i in window])
 
     def explained(turns: Doubles, reach: int) -> Doubles:
@@ -223,16 +209,17 @@ def _turn_at(looks: list[_Look], clock: Doubles, key: int) -> tuple[Doubles, flo
 
 
 def _turns(looks: list[_Look], clock: Doubles) -> Doubles:
-    """(T, 3, 3) rotations of a part, from the key time at which a turn explains most. clock: (T,) time steps."""
+    """(T, 3, 3) rotations of a part, from the key time at which a turn explains most, which up to five time steps from
+    there is kept. clock: (T,) time steps."""
     seen = np.flatnonzero([len(look.places) for look in looks])
-    keys = np.unique(seen[evenly_indices(len(seen), KEYS + 2)[1:-1]]).tolist()
+    keys = np.unique(seen[evenly_indices(len(seen), 5)[1:-1]]).tolist()
     turn, _, key = max(((*_turn_at(looks, clock, key), key) for key in keys), key=lambda found: found[1])
     lapses = clock - clock[key]
     R = Rotation.from_rotvec(lapses[:, None] * turn).as_matrix()
     known = np.zeros((4, SIDE, SIDE, SIDE))
     for i in sorted(range(len(looks)), key=lambda i: (abs(i - key), i)):
         last = i - np.sign(i - key) * np.arange(1, MEMORY + 2)
-        if abs(lapses[i]) > KEPT and 0 <= last[-1] < len(looks):
+        if abs(lapses[i]) > 5 and 0 <= last[-1] < len(looks):
             steps = Rotation.from_matrix(R[last[:-1]] @ np.swapaxes(R[last[1:]], 1, 2)).as_rotvec()
             turn = (steps / (clock[last[:-1]] - clock[last[1:]])[:, None]).mean(axis=0)
             onward = Rotation.from_rotvec((clock[i] - clock[last[0]]) * turn).as_matrix()
@@ -251,7 +238,7 @@ def _known(look: _Look, R: Doubles) -> Doubles:
 
 def _turn_of(look: _Look, expected: Doubles, sums: Doubles) -> Doubles:
     """The rotation (3, 3) near the expected one by which a time fits best what others show, as `_known` gives it."""
-    if not len(look.places) or not sums[0].any():
+    if not len(look.places):
         return expected
     total, mean = sums[0].sum(), sums[1:].sum(axis=(1, 2, 3)) / sums[0].sum()
     count, *blurred = (gaussian_filter(each, BLUR, mode="constant", truncate=2.5).ravel() for each in sums)
