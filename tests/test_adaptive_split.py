@@ -8,16 +8,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from lapgs_wgpu.train import adaptive_split as module
-from lapgs_wgpu.train.adaptive_split import (
+from lapgs_wgpu.train import densify as module
+from lapgs_wgpu.train.densify import (
+    DensityState,
+    Statistics,
     adaptive_split,
     divergence,
     nearest,
     probabilities,
+    published_rule,
     shape_difference,
     split_scores,
 )
-from lapgs_wgpu.train.densify import DensityState, Statistics, published_rule
 from lapgs_wgpu.train.presets import load_config
 
 CONFIG = dataclasses.replace(load_config("dnerf").density, split="adaptive")
