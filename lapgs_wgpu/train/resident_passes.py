@@ -85,11 +85,9 @@ class ResidentPasses:
 
     def terms(self, task: Task, values: list[float], totals: list[float]) -> dict[str, float]:
         """What each term adds to the loss of a step, by the losses of the image and of motion that `record` lists."""
-        weights, (l1, _, *others) = self._weights(task), values
-        found = {"l1": weights.l1 * l1}
-        for name, value in zip(("ssim", "pyramid", "ncc"), others, strict=True):
-            if weight := getattr(weights, name):
-                found[name] = weight * value
+        l1, _, *others = values
+        weighted = zip(self._weights(task)._asdict().items(), (l1, *others), strict=True)
+        found = {name: weight * value for (name, weight), value in weighted if weight or name == "l1"}
         static, temporal, even, dynamics = totals
         if task.near is not None:
             found["smoothness"] = static + temporal
@@ -235,10 +233,9 @@ class ResidentPasses:
         self, commands: Commands, task: Task, drawing: Drawing, by_drawn: GaussianGradients, terms: DeviceArray
     ) -> None:
         """Record whether the step may change anything, and what it changes."""
-        moving, count, guard = task.scheduled.moving, len(self._scene), self.guard
-        self.parameters.record_check(commands, self._bad, moving=moving)
-        self.corrections.record_check(commands, self._bad)
-        check_finite(commands, self._pool, terms, self._bad)
+        count, guard = len(self._scene), self.guard
+        for values in (*self.parameters.gradients(), *self.corrections.gradients(), terms):
+            check_finite(commands, self._pool, values, self._bad)
         close = Kernel.get(self._device, "close_guard")
         given = {"capacity": drawing.plan.capacity, "rounds": int(bool(self.rasterizer.config.round_splats))}
         guarded = self._pool.varying(
@@ -252,6 +249,6 @@ class ResidentPasses:
             arrays = {"splats": drawing.splats, "d_splats": by_drawn.splats, "statistics": self.seen()}
             seen = self._pool.constant(content)
             commands.dispatch(kernel, -(-count // 64), seen=seen, guard=guard, **arrays)
-        self.parameters.record_adam(commands, guard, moving=moving)
+        self.parameters.record_adam(commands, guard)
         geometry = self.parameters.blocks["geometry"].arrays["value"]
         self.corrections.record_step(commands, guard, drawing.frames[0], geometry)

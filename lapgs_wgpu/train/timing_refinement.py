@@ -52,8 +52,8 @@ class TimingRefinement:
             return timing.moments
         return np.array([timing(t) for t in self._times.tolist()])
 
-    def fitted(self, number: int) -> NDArray[np.float64]:
-        """(T,) all field times a step on. number: of the step, from 0 on: of several views of a time, it takes one.
+    def fitted(self, number: int) -> Timing:
+        """The timing a step on. number: of the step, from 0 on: of several views of a time, it takes one.
 
         The same bits on every run of one adapter and driver. Raises InputError where an image cannot be read.
         """
@@ -66,11 +66,8 @@ class TimingRefinement:
         moved = before + self._gap * shifts.clip(-LARGEST_SHIFT, LARGEST_SHIFT)
         farthest = FARTHEST * self._gap
         moved = np.clip(moved, self._times - farthest, self._times + farthest)
-        return np.maximum.accumulate(np.clip(moved, 0.0, 1.0))
-
-    def set(self, field_times: NDArray[np.float64]) -> None:
-        """Give the scene its timing. field_times: (T,), never descending."""
-        self._scene.timing = EVEN if (field_times == self._times).all() else Timing(self._times, field_times)
+        moved = np.maximum.accumulate(np.clip(moved, 0.0, 1.0))
+        return EVEN if (moved == self._times).all() else Timing(self._times, moved)
 
     def _fit(self, view: View, now: float) -> tuple[float, float]:
         """How much later the field time is that fits a view best, in gaps between images; and the share of the view's
