@@ -9,8 +9,7 @@ from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.matmul import sum_columns
 from lapgs_wgpu.gpu.pool import BufferPool
 from lapgs_wgpu.train.camera_refinement import MOST_POINTS, CameraRefinement
-from lapgs_wgpu.train.exposure import Exposures
-from lapgs_wgpu.train.fused_loss import exposure_of
+from lapgs_wgpu.train.exposure import Exposures, expose, expose_bwd
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.resident_parameters import Block, Place
 
@@ -42,7 +41,7 @@ class ResidentCorrections:
 
     def __init__(self, learners: Learners) -> None:
         device = self._device = learners.scene.device
-        self._pool, self._exposing = BufferPool(device), exposure_of(device)
+        self._pool = BufferPool(device)
         self._cameras, self._exposures, self._numbers = learners.cameras, learners.exposures, learners.image_numbers
         self._blocks: list[tuple[Block, CameraRefinement | Exposures]] = []
         if self._cameras is not None:
@@ -98,13 +97,14 @@ class ResidentCorrections:
         """Record the image with its colors corrected."""
         if self._exposures is None:
             return image
-        return self._exposing.record(commands, image, self._exposure_rows, self._first_row)
+        return expose(commands, self._pool, image, self._exposure_rows, self._first_row)
 
     def expose_bwd(self, commands: Commands, image: DeviceArray, d_exposed: DeviceArray) -> DeviceArray:
         """Record the gradient by the image, and that by the correction of its colors."""
         if self._exposures is None:
             return d_exposed
-        d_image, d_rows = self._exposing.record_bwd(commands, image, d_exposed, self._exposure_rows, self._first_row)
+        rows = self._exposure_rows
+        d_image, d_rows = expose_bwd(commands, self._pool, image, d_exposed, rows, self._first_row)
         sum_columns(commands, self._pool, d_rows, self._d_exposure, columns=12)
         return d_image
 

@@ -17,8 +17,8 @@ from lapgs_wgpu.splat.drawing import Drawing, GaussianGradients
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS, LossWeights
-from lapgs_wgpu.train.fused_loss import image_loss_of
 from lapgs_wgpu.train.ground_truth import Mark
+from lapgs_wgpu.train.image_loss import image_loss_of
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.resident_corrections import ResidentCorrections
 from lapgs_wgpu.train.resident_parameters import ResidentParameters, check_finite
