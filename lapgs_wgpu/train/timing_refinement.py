@@ -32,6 +32,11 @@ class TimingRefinement:
     it. gap: the usual distance in time of two images of a camera.
     """
 
+    summary = (  # of `report`
+        "the times of the training images were corrected by {frames:.2f} of the distance of two images (root mean "
+        "square; at most {frames_most:.2f})."
+    )
+
     def __init__(
         self,
         scene: Scene4D,
@@ -86,14 +91,6 @@ class TimingRefinement:
         """Differences of field times from image times: root mean square and largest, in gaps between images."""
         differences = np.abs(self._field_times - self._times) / self._gap
         return {"frames": float(np.sqrt(np.mean(differences**2))), "frames_most": float(differences.max())}
-
-    def summary(self) -> str:
-        """How far the times went, in a sentence."""
-        report = self.report()
-        return (
-            f"the times of the training images were corrected by {report['frames']:.2f} of the distance of two images "
-            f"(root mean square; at most {report['frames_most']:.2f})."
-        )
 
 
 def running_median(values: NDArray[np.float64], around: int) -> NDArray[np.float64]:
