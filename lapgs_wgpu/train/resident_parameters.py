@@ -153,12 +153,12 @@ class ResidentParameters:
             self.values_on_host.add(part)
         for part in set(parts or PARTS) - self.state_on_host if state else ():
             tensors = self._tensors[part]
-            state = {name: {kind: torch.zeros_like(each) for kind in MOMENTS} for name, each in tensors.items()}
+            adam = {name: {kind: torch.zeros_like(each) for kind in MOMENTS} for name, each in tensors.items()}
             for kind in MOMENTS:
-                self._read(part, kind, {name: each[kind] for name, each in state.items()})
+                self._read(part, kind, {name: each[kind] for name, each in adam.items()})
             for name, tensor in tensors.items():
                 if self.steps[name] and name != FREQUENCIES:
-                    self._states[tensor] = {"step": torch.tensor(float(self.steps[name])), **state[name]}
+                    self._states[tensor] = {"step": torch.tensor(float(self.steps[name])), **adam[name]}
             if part == "field" and self._frequencies is not None:
                 moments, own = self._frequency_state.read(), self._frequencies.state()
                 own["mean"].copy_(torch.from_numpy(moments[:-1]))
