@@ -19,7 +19,7 @@ from lapgs_wgpu.gpu.array import Buffer
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields import hash_encoder
 from lapgs_wgpu.run import train
-from lapgs_wgpu.train import fused_loss
+from lapgs_wgpu.train import exchange_step
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.optimizer import FrequencyOptimizer, Optimizer
 from lapgs_wgpu.train.presets import load_config
@@ -108,7 +108,7 @@ class _Clock:
             mock.patch.object(FrequencyOptimizer, "step", self._timed(OPTIMISER, FrequencyOptimizer.step)),
             *(
                 mock.patch.object(module, "read_all", read_when_done)
-                for module in (array_module, hash_encoder, fused_loss)
+                for module in (array_module, hash_encoder, exchange_step)
             ),
         ]
         for patch in patches:

@@ -14,7 +14,7 @@ from lapgs_wgpu.data.views import View
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.train.camera_refinement import CameraDescent, changed_camera, image_motion, scene_points, whitening
 from lapgs_wgpu.train.config import LossWeights, Rate
-from lapgs_wgpu.train.fused_loss import render_loss
+from lapgs_wgpu.train.exchange_step import render_loss
 from lapgs_wgpu.train.ground_truth import marked_pixels, upload_rgba
 
 STEPS = 24

@@ -155,7 +155,7 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
         for name, refinement in (("cameras", training.cameras), ("image_times", training.timing)):
             if refinement is not None:
                 measured[name] = refinement.report()
-                log.note(refinement.summary())
+                log.note(refinement.summary.format(**measured[name]))
 
     return_freed_memory()
     run_folder.save_state(out, training.state())

@@ -8,16 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from lapgs_wgpu.train import adaptive_split as module
-from lapgs_wgpu.train.adaptive_split import (
-    adaptive_split,
-    divergence,
-    nearest,
-    probabilities,
-    shape_difference,
-    split_scores,
-)
-from lapgs_wgpu.train.densify import DensityState, Statistics, published_rule
+from lapgs_wgpu.train import densify as module
+from lapgs_wgpu.train.densify import DensityState, Statistics, adaptive_split, divergence, nearest, probabilities
 from lapgs_wgpu.train.presets import load_config
 
 CONFIG = dataclasses.replace(load_config("dnerf").density, split="adaptive")
@@ -68,7 +60,7 @@ def test_fewer_gaussians_than_neighbours(count: int) -> None:
     found = nearest(rows["means"], torch.arange(count), 10)
     assert found.shape == (count, count - 1)
     assert all(sorted([i, *row]) == list(range(count)) for i, row in enumerate(found.tolist()))
-    scores = split_scores(rows, torch.arange(count))
+    scores = module.split_scores(rows, torch.arange(count))
     assert scores.isfinite().all()
     assert count > 1 or scores.tolist() == [0.0]
     assert adaptive_split(rows, everyone(rows)).any(), "the highest score reaches every quantile"
@@ -81,7 +73,7 @@ def test_shape_difference_by_hand() -> None:
     own, other = torch.diag(torch.tensor([4.0, 0.0, 3.0])), torch.diag(torch.tensor([0.0, 0.0, 3.0]))
     two = torch.stack([other, own])[None]
     # |S - S'| = 4, |S| = 5, |S'| = 3; and none from the neighbour that is equal.
-    assert shape_difference(own[None], two).tolist() == pytest.approx([(4 / 8 + 0) / 2])
+    assert module.shape_difference(own[None], two).tolist() == pytest.approx([(4 / 8 + 0) / 2])
 
 
 # Dynamics
@@ -100,9 +92,9 @@ def test_divergence_is_zero_for_uniform_and_one_for_one_hot() -> None:
 def test_dynamics_count_where_shapes_are_equal() -> None:
     rows = equals(12)
     of = torch.tensor([0, 11])
-    assert split_scores(rows, of, 3).tolist() == pytest.approx([0, 0], abs=1e-12)
+    assert module.split_scores(rows, of, 3).tolist() == pytest.approx([0, 0], abs=1e-12)
     rows["dynamics"][2, 0] += 1.0  # a neighbour of the first alone
-    high, low = split_scores(rows, of, 3).tolist()
+    high, low = module.split_scores(rows, of, 3).tolist()
     expected = divergence(probabilities(torch.tensor([[0.0, 1.0, 0.0]]))).item()
     assert expected > 0.8
     assert high == pytest.approx(0.5 * expected, rel=1e-5)
@@ -113,7 +105,7 @@ def test_without_dynamics_the_distances_between_means_count() -> None:
     rows = equals(12)
     del rows["dynamics"]
     # Neighbours of the first are 1, 2 and 3 away; of one in the middle 1, 1 and 2.
-    first, middle = split_scores(rows, torch.tensor([0, 5]), 3).tolist()
+    first, middle = module.split_scores(rows, torch.tensor([0, 5]), 3).tolist()
     assert first == pytest.approx(0.5 * divergence(probabilities(torch.tensor([[1.0, 2.0, 3.0]]))).item(), rel=1e-5)
     assert middle == pytest.approx(0.5 * divergence(probabilities(torch.tensor([[1.0, 1.0, 2.0]]))).item(), rel=1e-5)
     assert adaptive_split(rows, everyone(rows)).any()
@@ -139,7 +131,7 @@ def test_outliers_are_split_whatever_their_score() -> None:
     rows["dynamics"] *= 0
     candidates = torch.arange(100) % 2 == 0
     before = adaptive_split(rows, candidates)
-    lowest = int(split_scores(rows, torch.arange(0, 100, 2)).argmin()) * 2
+    lowest = int(module.split_scores(rows, torch.arange(0, 100, 2)).argmin()) * 2
     assert not before[lowest]
     rows["dynamics"][[lowest, lowest + 1]] = 100.0
     after = adaptive_split(rows, candidates)
@@ -157,7 +149,7 @@ def test_quantile_zero_is_the_plain_split(monkeypatch: pytest.MonkeyPatch) -> No
     rows, statistics = make_rows(30), Statistics.zeros(30)
     statistics.gradients, statistics.views = torch.ones(30), torch.ones(30)
     changes = [
-        published_rule(DensityState(1, rows, statistics, config, EXTENT, torch.Generator().manual_seed(0)))
+        module.published_rule(DensityState(1, rows, statistics, config, EXTENT, torch.Generator().manual_seed(0)))
         for config in (dataclasses.replace(CONFIG, split="plain"), CONFIG)
     ]
     assert not changes[0].keep.any()

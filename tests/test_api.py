@@ -36,8 +36,7 @@ from lapgs_wgpu.motion.fields.own_field import OwnField
 from lapgs_wgpu.motion.timing import Timing
 from lapgs_wgpu.splat.rotation import rotate, rotation_matrices
 from lapgs_wgpu.train.config import LossWeights, Rate
-from lapgs_wgpu.train.exchange_step import ExchangeStep
-from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
+from lapgs_wgpu.train.exchange_step import ExchangeStep, RenderLoss, render_loss
 from lapgs_wgpu.train.ground_truth import upload_rgba
 from lapgs_wgpu.train.parts import LossTerm, torch_loss
 from lapgs_wgpu.train.presets import load_config

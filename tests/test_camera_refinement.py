@@ -30,7 +30,7 @@ from lapgs_wgpu.train.camera_refinement import (
     whitening,
 )
 from lapgs_wgpu.train.config import CamerasConfig, Rate
-from lapgs_wgpu.train.fused_loss import render_loss
+from lapgs_wgpu.train.exchange_step import render_loss
 from lapgs_wgpu.train.ground_truth import upload_rgba
 from lapgs_wgpu.train.learners import restore_tensors
 from lapgs_wgpu.train.presets import load_config

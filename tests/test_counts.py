@@ -22,8 +22,9 @@ from lapgs_wgpu.gpu.radix_sort import FEW_RUNS, runs
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.train.config import LossWeights
-from lapgs_wgpu.train.fused_loss import image_loss_of, render_loss
+from lapgs_wgpu.train.exchange_step import render_loss
 from lapgs_wgpu.train.ground_truth import upload_rgba
+from lapgs_wgpu.train.image_loss import image_loss_of
 from lapgs_wgpu.train.trainer import Trainer
 
 pytestmark = pytest.mark.kernels

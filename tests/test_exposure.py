@@ -12,11 +12,11 @@ from helpers.training import configure
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data import Dataset
-from lapgs_wgpu.gpu.array import DeviceArray
+from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.train.config import Rate
-from lapgs_wgpu.train.exposure import ExposurePasses, Exposures
+from lapgs_wgpu.train.exposure import Exposures, expose, expose_bwd
 from lapgs_wgpu.train.learners import restore_tensors
 from lapgs_wgpu.train.trainer import Trainer
 
@@ -34,12 +34,12 @@ def test_exposure(device: Device, size: tuple[int, int]) -> None:
     """The image, and its gradient to the image and to the correction, are the reference's in float64."""
     rng = np.random.default_rng(size[0])
     image, d_exposed = (rng.random((4, *size), np.float32) for _ in range(2))
-    passes = ExposurePasses(device)
+    pool = BufferPool(device)
     drawn, d = DeviceArray.upload(device, "image", image), DeviceArray.upload(device, "d_exposed", d_exposed)
     rows = DeviceArray.upload(device, "rows", np.concatenate([np.zeros((2, 4), np.float32), CORRECTION.numpy()]))
     with Commands(device) as commands:
-        exposed = passes.record(commands, drawn, rows, lambda: 2)
-        d_image, d_rows = passes.record_bwd(commands, drawn, d, rows, lambda: 2)
+        exposed = expose(commands, pool, drawn, rows, lambda: 2)
+        d_image, d_rows = expose_bwd(commands, pool, drawn, d, rows, lambda: 2)
 
     def tensor(planes: NDArray[np.float32]) -> torch.Tensor:
         return torch.from_numpy(planes[:3]).permute(1, 2, 0).double()

@@ -20,7 +20,7 @@ from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.run import train
 from lapgs_wgpu.splat.rasterize import rasterize
-from lapgs_wgpu.train.fused_loss import render_loss
+from lapgs_wgpu.train.exchange_step import render_loss
 from lapgs_wgpu.train.ground_truth import marked_pixels, upload_rgba
 from lapgs_wgpu.train.run_folder import start_run_folder
 

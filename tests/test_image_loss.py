@@ -27,9 +27,9 @@ from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterize
 from lapgs_wgpu.splat.rasterizer import Rasterizer
-from lapgs_wgpu.train import fused_loss, image_metrics
+from lapgs_wgpu.train import exchange_step, image_metrics
 from lapgs_wgpu.train.config import LossWeights
-from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
+from lapgs_wgpu.train.exchange_step import RenderLoss, render_loss
 from lapgs_wgpu.train.ground_truth import upload_rgba
 from lapgs_wgpu.train.image_loss import ImageLoss
 
@@ -204,7 +204,7 @@ def test_overflow_and_bands_do_not_show(device: Device, monkeypatch: pytest.Monk
     for capacity, most in ((1 << 16, 1 << 20), (16, 1 << 20), (400, 400)):
         rasterizer = Rasterizer(device, capacity=capacity)
         rasterizer.max_capacity = most
-        monkeypatch.setattr(fused_loss, "rasterizer_of", lambda device, one=rasterizer: one)
+        monkeypatch.setattr(exchange_step, "rasterizer_of", lambda device, one=rasterizer: one)
         scene = gaussians(400)
         done = step(device, scene)
         done.loss.backward()

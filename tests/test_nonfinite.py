@@ -17,7 +17,7 @@ from lapgs_wgpu.errors import NumericalError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.train import exchange_step
-from lapgs_wgpu.train.fused_loss import RenderLoss
+from lapgs_wgpu.train.exchange_step import RenderLoss
 from lapgs_wgpu.train.run_folder import STATE, load_state
 from lapgs_wgpu.train.trainer import Trainer
 

@@ -69,7 +69,7 @@ def refinement(scene: Scene4D, truth: Callable[[View], Tensor], times: Sequence[
 def refine(scene: Scene4D, truth: Callable[[View], Tensor], times: int = 1) -> TimingRefinement:
     found = refinement(scene, truth)
     for number in range(times):
-        found.set(found.fitted(number))
+        scene.timing = found.fitted(number)
     return found
 
 

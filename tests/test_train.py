@@ -25,7 +25,7 @@ from lapgs_wgpu.motion.scene import Scene4D, load
 from lapgs_wgpu.run import train
 from lapgs_wgpu.train import exchange_step
 from lapgs_wgpu.train.config import LossWeights
-from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
+from lapgs_wgpu.train.exchange_step import RenderLoss, render_loss
 from lapgs_wgpu.train.log import Log
 from lapgs_wgpu.train.parts import Parts
 from lapgs_wgpu.train.presets import load_config

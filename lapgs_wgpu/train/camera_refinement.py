@@ -123,6 +123,10 @@ class CameraRefinement:
     """
 
     name = "cameras"
+    summary = (  # of `report`
+        "the training cameras were corrected by {rotation_degrees[median]:.2f} degrees and {shift_percent[median]:.2f} "
+        "% of their extent (medians; at most {rotation_degrees[largest]:.2f} and {shift_percent[largest]:.2f} %)."
+    )
 
     def __init__(
         self,
@@ -190,15 +194,6 @@ class CameraRefinement:
             name: {"median": float(np.median(values)), "largest": float(values.max())}
             for name, values in (("rotation_degrees", turns), ("shift_percent", shifts))
         }
-
-    def summary(self) -> str:
-        """How far the cameras went, in a sentence."""
-        report = self.report()
-        turn, shift = report["rotation_degrees"], report["shift_percent"]
-        return (
-            f"the training cameras were corrected by {turn['median']:.2f} degrees and {shift['median']:.2f} % of their "
-            f"extent (medians; at most {turn['largest']:.2f} and {shift['largest']:.2f} %)."
-        )
 
     def state(self) -> dict[str, Tensor]:
         """Everything that the next step depends on, besides the gradient."""

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
-from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.train.config import Rate
 
@@ -25,52 +24,46 @@ def without_exposure(image: NDArray[np.float32], correction: NDArray[np.float32]
     return (image - correction[:, 3]) @ np.linalg.pinv(correction[:, :3]).T
 
 
-class ExposurePasses:
-    """Records the passes between a rendered image and its losses. Keeps its buffers from image to image."""
+def expose(
+    commands: Commands,
+    pool: BufferPool,
+    image: DeviceArray,
+    corrections: DeviceArray,
+    first: Callable[[], int] = lambda: 0,
+) -> DeviceArray:
+    """Record the corrected image, in an array of the pool.
 
-    def __init__(self, device: Device) -> None:
-        self.device = device
-        self.pool = BufferPool(device)
-        self._lanes = 8 if device.is_cpu else 64
+    image: planes (4, H, W) of float32, the first three red, green, blue. corrections: rows of four; `first` says which
+    are the first of the image's three.
+    """
+    exposed = pool.array("exposed", image.shape)
+    _dispatch(commands, pool, "exposure", first, image=image, corrections=corrections, exposed=exposed)
+    return exposed
 
-    def record(
-        self, commands: Commands, image: DeviceArray, corrections: DeviceArray, first: Callable[[], int] = lambda: 0
-    ) -> DeviceArray:
-        """The corrected image.
 
-        image: planes (4, H, W) of float32, the first three red, green, blue. corrections: rows of four; `first` says
-        which are the first of the image's three.
-        """
-        exposed = self.pool.array("exposed", image.shape)
-        self._dispatch(commands, "exposure", first, image=image, corrections=corrections, exposed=exposed)
-        return exposed
+def expose_bwd(
+    commands: Commands,
+    pool: BufferPool,
+    image: DeviceArray,
+    d_exposed: DeviceArray,
+    corrections: DeviceArray,
+    first: Callable[[], int] = lambda: 0,
+) -> tuple[DeviceArray, DeviceArray]:
+    """Record the gradient by the rendered image's planes (4, H, W), and rows (H, 3, 4), whose sum is the correction's.
 
-    def record_bwd(
-        self,
-        commands: Commands,
-        image: DeviceArray,
-        d_exposed: DeviceArray,
-        corrections: DeviceArray,
-        first: Callable[[], int] = lambda: 0,
-    ) -> tuple[DeviceArray, DeviceArray]:
-        """The gradient by the rendered image's planes (4, H, W), and rows (H, 3, 4), whose sum is the correction's.
+    d_exposed: the gradient by the corrected image; its fourth plane counts as zeros.
+    """
+    d_image, d_rows = pool.array("d_drawn", image.shape), pool.array("d_rows", (image.shape[1], 3, 4))
+    arrays = {"image": image, "d_exposed": d_exposed, "corrections": corrections, "d_image": d_image, "d_rows": d_rows}
+    _dispatch(commands, pool, "exposure_bwd", first, **arrays)
+    return d_image, d_rows
 
-        d_exposed: the gradient by the corrected image; its fourth plane counts as zeros.
-        """
-        d_image, d_rows = self.pool.array("d_image", image.shape), self.pool.array("d_rows", (image.shape[1], 3, 4))
-        arrays = {"image": image, "d_exposed": d_exposed, "corrections": corrections}
-        self._dispatch(commands, "exposure_bwd", first, **arrays, d_image=d_image, d_rows=d_rows)
-        return d_image, d_rows
 
-    def _dispatch(
-        self, commands: Commands, name: str, first: Callable[[], int], *, image: DeviceArray, **arrays: DeviceArray
-    ) -> None:
-        _, height, width = image.shape
-        kernel = Kernel.get(self.device, name, LANES=self._lanes)
-        exposure = self.pool.varying(
-            "exposure", lambda: kernel.uniform("Exposure", size=(width, height), first=first())
-        )
-        commands.dispatch_grid(kernel, (1, height), exposure=exposure, image=image, **arrays)
+def _dispatch(commands: Commands, pool: BufferPool, name: str, first: Callable[[], int], **arrays: DeviceArray) -> None:
+    kernel = Kernel.get(pool.device, name, LANES=8 if pool.device.is_cpu else 64)
+    _, height, width = arrays["image"].shape
+    exposure = pool.varying("exposure", lambda: kernel.uniform("Exposure", size=(width, height), first=first()))
+    commands.dispatch_grid(kernel, (1, height), exposure=exposure, **arrays)
 
 
 class Exposures:

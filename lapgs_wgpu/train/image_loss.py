@@ -4,6 +4,8 @@ The order of the passes is that of `ImageLoss.record`; docs/architecture.md list
 device.
 """
 
+import functools
+
 import numpy as np
 
 from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
@@ -77,6 +79,9 @@ class ImageLoss:
     def held(self, truth: DeviceArray) -> DeviceArray:
         """Where a ground truth (H, W) is copied to: all of a training go through one buffer, texture and bind group."""
         return self.pool.array("truth", truth.shape, "uint32")
+
+
+image_loss_of = functools.cache(ImageLoss)  # that of a device, whose buffers serve all images
 
 
 class _Frame:

@@ -68,8 +68,9 @@ class Learners:
         self.optimizer.highest = max_field_rates(self._groups, fitted) if fitted else {}
 
     def camera(self, view: View) -> Camera:
-        """The camera of a training view, corrected where it is."""
-        return view.camera if (cameras := self.cameras) is None else cameras.refined(view.camera)
+        """The camera of a view; that of a training view corrected, where it is."""
+        cameras = self.cameras
+        return cameras.refined(view.camera) if cameras and view.camera in cameras.numbers else view.camera
 
     def camera_change(self, view: View) -> Tensor | None:
         """(6,) zeros that get the gradient by a change of a training view's camera; None where it is kept."""

@@ -66,8 +66,7 @@ class Optimizer:
         self.on_access("gaussians")
         for name, old in self.gaussians.items():
             new = old.detach()[:0] if added is None else added[name]
-            zeros = torch.zeros_like(new)
-            moments = {key: torch.cat([moment[rows], zeros]) for key, moment in self.moments(name).items()}
+            moments = {key: torch.cat([each[rows], torch.zeros_like(new)]) for key, each in self.moments(name).items()}
             self._replace(name, torch.cat([old.detach()[rows], new]), moments)
 
     def reset(self, name: str, values: Tensor) -> None:

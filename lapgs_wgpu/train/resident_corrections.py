@@ -7,11 +7,10 @@ from lapgs_wgpu.data.views import View
 from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.matmul import sum_columns
-from lapgs_wgpu.train.camera_refinement import MOST_POINTS, CameraRefinement, Pace
-from lapgs_wgpu.train.exposure import Exposures
-from lapgs_wgpu.train.fused_loss import exposure_of
+from lapgs_wgpu.train.camera_refinement import MOST_POINTS, CameraRefinement
+from lapgs_wgpu.train.exposure import Exposures, expose, expose_bwd
 from lapgs_wgpu.train.learners import Learners
-from lapgs_wgpu.train.resident_parameters import Block, Place, check_finite
+from lapgs_wgpu.train.resident_parameters import Block, Place
 
 _CAMERA_FLOATS, _EXPOSURE_FLOATS = 16, 40  # rows of camera_step.wgsl and exposure_step.wgsl
 _MOTION_FLOATS, _MOST_COMMON = 22, 8  # image_motion.wgsl, camera_step.wgsl
@@ -35,12 +34,13 @@ _PLACES: dict[str, dict[str, Place]] = {
 class ResidentCorrections:
     """The corrections of a training and the state by which they learn, on a device.
 
-    on_host: whether the host may have changed them since they were pushed.
+    on_host: whether the host may have changed them since they were pushed. moves_camera: whether this step moves its
+    camera.
     """
 
     def __init__(self, learners: Learners) -> None:
         device = self._device = learners.scene.device
-        self._pool, self._exposing = BufferPool(device), exposure_of(device)
+        self._pool = BufferPool(device)
         self._cameras, self._exposures, self._numbers = learners.cameras, learners.exposures, learners.image_numbers
         self._blocks: list[tuple[Block, CameraRefinement | Exposures]] = []
         if self._cameras is not None:
@@ -51,8 +51,7 @@ class ResidentCorrections:
         if self._exposures is not None:
             self._exposure_rows = self._add(self._exposures, (len(self._exposures.values), _EXPOSURE_FLOATS))
         self._d_camera, self._d_exposure = self._pool.array("d_camera", (8,)), self._pool.array("d_exposure", (12,))
-        self._pace: Pace | None = None
-        self.on_host = True
+        self.on_host, self.moves_camera = True, False
 
     def _add(self, of: CameraRefinement | Exposures, shape: tuple[int, int]) -> DeviceArray:
         rows = self._pool.array(of.name, shape)
@@ -78,12 +77,8 @@ class ResidentCorrections:
         """Say what is recorded or replayed next: a step, counted from 1, and its view."""
         self._step, self._image = step, self._numbers[view.name]
         if self._cameras is not None:
-            self._camera, self._pace = self._cameras.numbers[view.camera], self._cameras.pace(step)
-
-    @property
-    def moves_camera(self) -> bool:
-        """Whether this step moves its camera."""
-        return self._pace is not None
+            self._camera, pace = self._cameras.numbers[view.camera], self._cameras.pace(step)
+            self.moves_camera, self._pace = pace is not None, pace._asdict() if pace else {}
 
     # Passes, in their order ------------------------------------------------------------------------------------------
 
@@ -101,13 +96,14 @@ class ResidentCorrections:
         """Record the image with its colors corrected."""
         if self._exposures is None:
             return image
-        return self._exposing.record(commands, image, self._exposure_rows, self._first_row)
+        return expose(commands, self._pool, image, self._exposure_rows, self._first_row)
 
     def expose_bwd(self, commands: Commands, image: DeviceArray, d_exposed: DeviceArray) -> DeviceArray:
         """Record the gradient by the image, and that by the correction of its colors."""
         if self._exposures is None:
             return d_exposed
-        d_image, d_rows = self._exposing.record_bwd(commands, image, d_exposed, self._exposure_rows, self._first_row)
+        rows = self._exposure_rows
+        d_image, d_rows = expose_bwd(commands, self._pool, image, d_exposed, rows, self._first_row)
         sum_columns(commands, self._pool, d_rows, self._d_exposure, columns=12)
         return d_image
 
@@ -119,11 +115,10 @@ class ResidentCorrections:
             rows, total = sums.rows(half, 1), self._d_camera
             sum_columns(commands, self._pool, rows, total, columns=4, place=4 * half, factor=factor)
 
-    def record_check(self, commands: Commands, bad: DeviceArray) -> None:
-        """Record the search for gradients that are not finite."""
-        for gradient, used in ((self._d_camera, self.moves_camera), (self._d_exposure, self._exposures is not None)):
-            if used:
-                check_finite(commands, self._pool, gradient, bad)
+    def gradients(self) -> list[DeviceArray]:
+        """Of all that the step moves."""
+        of_camera = [self._d_camera] if self.moves_camera else []
+        return of_camera if self._exposures is None else [*of_camera, self._d_exposure]
 
     def record_step(self, commands: Commands, guard: DeviceArray, frame: DeviceArray, geometry: DeviceArray) -> None:
         """Record a step of the corrections, after the one of the Gaussians. frame: that `move` gave; geometry: (N, 12)
@@ -133,12 +128,12 @@ class ResidentCorrections:
         if (exposures := self._exposures) is None:
             return
         kernel, count = Kernel.get(self._device, "exposure_step"), len(exposures.values)
-
-        def write() -> bytes:
-            return kernel.uniform("ExposureStep", number=self._image, count=count, rate=exposures.rate.at(self._step))
-
+        descent = self._pool.varying(
+            "exposure step",
+            lambda: kernel.uniform("ExposureStep", number=self._image, count=count, rate=exposures.rate.at(self._step)),
+        )
         arrays = {"guard": guard, "d_exposure": self._d_exposure, "exposures": self._exposure_rows}
-        commands.dispatch(kernel, 1, descent=self._pool.varying("exposure step", write), **arrays)
+        commands.dispatch(kernel, 1, descent=descent, **arrays)
 
     def _step_camera(self, commands: Commands, guard: DeviceArray, frame: DeviceArray, geometry: DeviceArray) -> None:
         assert self._cameras is not None
@@ -148,13 +143,11 @@ class ResidentCorrections:
         seen = self._pool.constant(content)
         commands.dispatch(motion_kernel, 1, seen=seen, frame=frame, geometry=geometry, motion=motion)
         kernel = Kernel.get(self._device, "camera_step")
-
-        def write() -> bytes:
-            assert self._pace is not None
-            return kernel.uniform("CameraStep", number=self._camera, cameras=cameras, **self._pace._asdict())
-
+        descent = self._pool.varying(
+            "camera step",
+            lambda: kernel.uniform("CameraStep", number=self._camera, cameras=cameras, **self._pace),
+        )
         arrays = {"guard": guard, "motion": motion, "d_camera": self._d_camera, "common_motions": self._common}
-        descent = self._pool.varying("camera step", write)
         commands.dispatch(kernel, 1, descent=descent, cameras=self._camera_rows, **arrays)
 
     def _first_row(self) -> int:

@@ -4,7 +4,7 @@ Between two looks of the host the device has the newest values. Whoever reads to
 next step pushes what the host may have changed.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -21,7 +21,8 @@ from lapgs_wgpu.motion.passes.grid_field_passes import FieldArrays, GridFieldPas
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.optimizer import LARGEST_FREQUENCY_STEP
 
-KINDS = ("value", "gradient", "mean", "square")
+MOMENTS = ("exp_avg", "exp_avg_sq")  # as torch's Adam names them
+KINDS = ("value", "gradient", *MOMENTS)
 PARTS = ("gaussians", "field")  # of a scene, which go between host and device by themselves
 FREQUENCIES = "motion.frequencies"
 Place = tuple[slice, slice]  # rows and columns of an array
@@ -32,8 +33,8 @@ class Block:
     """A matrix (rows, columns) on the device in which torch's tensors lie.
 
     group: of the optimizer that all values belong to; None where each tensor is a group of its own. parts: by name of a
-    tensor its place. ones: whether the last column holds ones, which no step changes. moved: number of values that Adam
-    moves; the others have an optimizer of their own. moving: whether only steps with motion move them. arrays: by kind.
+    tensor its place. ones: whether the last column holds ones, which no step changes. moving: whether only steps with
+    motion move them. arrays: by kind.
     """
 
     name: str
@@ -41,7 +42,6 @@ class Block:
     group: str | None
     parts: dict[str, Place]
     ones: bool = False
-    moved: int | None = None
     moving: bool = True
     arrays: dict[str, DeviceArray] = field(default_factory=dict)
 
@@ -51,8 +51,7 @@ class Block:
         if self.ones:
             out[:, -1] = 1.0
         for name, place in self.parts.items():
-            tensor = tensors[name]
-            if tensor is not None:
+            if (tensor := tensors[name]) is not None:
                 target = out[place]
                 target[...] = tensor.detach().numpy(force=True).reshape(target.shape)
         return out
@@ -118,10 +117,9 @@ class ResidentParameters:
             for name, table in tensors.items()
             if name.endswith(".table")
         ]
-        places, shape = self._weights.places, (self._weights.count, 1)
-        rows = {name: np.s_[first : first + tensors[name].numel(), :] for name, first in places.items()}
-        moved = places.get(FREQUENCIES)
-        return [*blocks, Block("weights", shape, "mlp", rows, moved=moved)]
+        places = self._weights.places.items()
+        rows = {name: np.s_[first : first + tensors[name].numel(), :] for name, first in places}
+        return [*blocks, Block("weights", (self._weights.count, 1), "mlp", rows)]
 
     def push_values(self) -> None:
         """Upload the values that the host may have changed."""
@@ -137,8 +135,8 @@ class ResidentParameters:
         for part in self.state_on_host:
             state = {name: self._states.get(tensor, {}) for name, tensor in self._tensors[part].items()}
             self.steps |= {name: int(each.get("step", 0)) for name, each in state.items()}
-            for kind, key in (("mean", "exp_avg"), ("square", "exp_avg_sq")):
-                self._write(part, kind, {name: each.get(key) for name, each in state.items()})
+            for kind in MOMENTS:
+                self._write(part, kind, {name: each.get(kind) for name, each in state.items()})
             if part == "field" and self._frequencies is not None:
                 own = self._frequencies.state()
                 self.steps[FREQUENCIES] = int(own["steps"])
@@ -154,13 +152,12 @@ class ResidentParameters:
             self.values_on_host.add(part)
         for part in set(parts or PARTS) - self.state_on_host if state else ():
             tensors = self._tensors[part]
-            means, squares = ({name: torch.zeros_like(tensor) for name, tensor in tensors.items()} for _ in range(2))
-            self._read(part, "mean", means)
-            self._read(part, "square", squares)
+            adam = {name: {kind: torch.zeros_like(each) for kind in MOMENTS} for name, each in tensors.items()}
+            for kind in MOMENTS:
+                self._read(part, kind, {name: each[kind] for name, each in adam.items()})
             for name, tensor in tensors.items():
                 if self.steps[name] and name != FREQUENCIES:
-                    steps = torch.tensor(float(self.steps[name]))
-                    self._states[tensor] = {"step": steps, "exp_avg": means[name], "exp_avg_sq": squares[name]}
+                    self._states[tensor] = {"step": torch.tensor(float(self.steps[name])), **adam[name]}
             if part == "field" and self._frequencies is not None:
                 moments, own = self._frequency_state.read(), self._frequencies.state()
                 own["mean"].copy_(torch.from_numpy(moments[:-1]))
@@ -175,33 +172,24 @@ class ResidentParameters:
 
     def arrays(self, kind: str) -> FieldArrays:
         """What the field computes with (kind "value"), or its gradients; the Gaussians' own for a scene without one."""
-        tables = [block.arrays[kind] for name, block in self.blocks.items() if name.endswith(".table")]
-        geometry, sh = (self.blocks[name].arrays[kind] for name in ("geometry", "sh"))
-        if self._weights is None:
-            return FieldArrays(geometry, sh, geometry, [], geometry)
-        return FieldArrays(geometry, sh, self.blocks["beside"].arrays[kind], tables, self.flat_weights(kind))
-
-    def flat_weights(self, kind: str) -> DeviceArray:
-        """The field's weights as one row of numbers."""
-        array = self.blocks["weights"].arrays[kind]
-        return DeviceArray(array.buffer, (array.shape[0],), array.dtype, array.offset)
+        found = {name: block.arrays[kind] for name, block in self.blocks.items()}
+        geometry, tables = found["geometry"], [array for name, array in found.items() if name.endswith(".table")]
+        beside, weights = found.get("beside", geometry), found.get("weights", geometry)
+        return FieldArrays(geometry, found["sh"], beside, tables, weights)
 
     # Passes ----------------------------------------------------------------------------------------------------------
-
-    def _moved(self, *, moving: bool) -> Iterator[Block]:
-        return (block for block in self.blocks.values() if moving or not block.moving)
-
-    def record_check(self, commands: Commands, bad: DeviceArray, *, moving: bool) -> None:
-        """Record the search for gradients that are not finite."""
-        for block in self._moved(moving=moving):
-            check_finite(commands, self._pool, block.arrays["gradient"], bad)
 
     def begin(self, rates: Mapping[str, float], *, moving: bool) -> None:
         """Say what is recorded or replayed next: a step at these rates of the optimizer's groups and of FREQUENCIES."""
         self._rates = rates
-        for block in self._moved(moving=moving):
+        self._moved = [block for block in self.blocks.values() if moving or not block.moving]
+        for block in self._moved:
             for name in block.parts:
                 self.steps[name] += 1
+
+    def gradients(self) -> list[DeviceArray]:
+        """Of all that the step moves."""
+        return [block.arrays["gradient"] for block in self._moved]
 
     def _rates_of(self, block: Block) -> bytes:
         """The corrected rates of a step, a pair for each column."""
@@ -211,26 +199,27 @@ class ResidentParameters:
                 table[columns] = _corrected(self._rates[block.group or name], self.steps[name])
         return table.tobytes()
 
-    def record_adam(self, commands: Commands, guard: DeviceArray, *, moving: bool) -> None:
+    def record_adam(self, commands: Commands, guard: DeviceArray) -> None:
         """Record a step of the optimizers."""
         kernel = Kernel.get(self._device, "adam")
-        for block in self._moved(moving=moving):
+        for block in self._moved:
             written = self._pool.varying(f"rates {block.name}", partial(self._rates_of, block))
             rates = DeviceArray(written.buffer, (block.shape[1], 2), offset=written.offset)
-            count = block.arrays["value"].size if block.moved is None else block.moved
-            content = kernel.uniform("Adam", count=count, columns=block.shape[1], first=0)
-            arrays = {name: block.arrays[name[:-1]] for name in ("gradients", "values", "means", "squares")}
-            adam = self._pool.constant(content)
+            frequencies, _ = block.parts.get(FREQUENCIES, (None, None))  # the last values, which Adam leaves alone
+            count = frequencies.start if frequencies else block.arrays["value"].size
+            adam = self._pool.constant(kernel.uniform("Adam", count=count, columns=block.shape[1], first=0))
+            arrays = dict(zip(("values", "gradients", "means", "squares"), block.arrays.values(), strict=True))
             commands.dispatch(kernel, -(-count // 256), adam=adam, guard=guard, rates=rates, **arrays)
-        if moving and self._frequencies is not None:
-            self._record_frequencies(commands, guard, self._frequencies.limit)
+            if frequencies:
+                self._record_frequencies(commands, guard)
 
-    def _record_frequencies(self, commands: Commands, guard: DeviceArray, limit: float) -> None:
+    def _record_frequencies(self, commands: Commands, guard: DeviceArray) -> None:
         assert self._weights is not None
+        assert self._frequencies is not None
         kernel, config = Kernel.get(self._device, "adam_frequencies"), self._weights.config
         given = {name: self._weights.places[f"motion.{name}"] for name in ("alpha", "beta", "frequencies")}
         given |= {"width": config.width, "components": config.components}
-        bounds = {"limit": limit, "largest": LARGEST_FREQUENCY_STEP}
+        bounds = {"limit": self._frequencies.limit, "largest": LARGEST_FREQUENCY_STEP}
         bounds |= {"floor": VARIANCE_FLOOR, "spread": VARIANCE_SPREAD}
 
         def write() -> bytes:
@@ -238,7 +227,7 @@ class ResidentParameters:
             return kernel.uniform("Frequencies", rate=corrected, square_factor=factor, **given, **bounds)
 
         spectrum = self._pool.varying("frequencies uniform", write)
-        weights = {"weights": self.flat_weights("value"), "d_weights": self.flat_weights("gradient")}
+        weights = {"weights": self.arrays("value").weights, "d_weights": self.arrays("gradient").weights}
         commands.dispatch(kernel, 1, spectrum=spectrum, guard=guard, state=self._frequency_state, **weights)
 
 

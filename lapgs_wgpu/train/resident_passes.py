@@ -12,14 +12,14 @@ from lapgs_wgpu.gpu.kernel import Commands, Kernel, Later, Recording
 from lapgs_wgpu.gpu.matmul import sum_columns
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.passes.activation_passes import ActivationPasses, Line
-from lapgs_wgpu.motion.passes.grid_field_passes import Decoding, GridFieldPasses
+from lapgs_wgpu.motion.passes.grid_field_passes import Decoding, FieldArrays, GridFieldPasses
 from lapgs_wgpu.motion.passes.samples import Samples
 from lapgs_wgpu.splat.drawing import Drawing, GaussianGradients
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.train.config import LossWeights
-from lapgs_wgpu.train.fused_loss import image_loss_of
 from lapgs_wgpu.train.ground_truth import Mark
+from lapgs_wgpu.train.image_loss import image_loss_of
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.resident_corrections import ResidentCorrections
 from lapgs_wgpu.train.resident_parameters import ResidentParameters, check_finite
@@ -85,11 +85,9 @@ class ResidentPasses:
 
     def terms(self, task: Task, values: list[float], totals: list[float]) -> dict[str, float]:
         """What each term adds to the loss of a step, by the losses of the image and of motion that `record` lists."""
-        weights, (l1, _, *others) = self._weights(task), values
-        found = {"l1": weights.l1 * l1}
-        for name, value in zip(("ssim", "pyramid", "ncc"), others, strict=True):
-            if weight := getattr(weights, name):
-                found[name] = weight * value
+        l1, _, *others = values
+        weighted = zip(self._weights(task)._asdict().items(), (l1, *others), strict=True)
+        found = {name: weight * value for (name, weight), value in weighted if weight or name == "l1"}
         static, temporal, even, dynamics = totals
         if task.near is not None:
             found["smoothness"] = static + temporal
@@ -152,31 +150,50 @@ class ResidentPasses:
     def _record(self, commands: Commands, task: Task, truth: DeviceArray) -> Recorded:
         for array in (self._bad, self._totals):
             commands.clear(array)
-        decoding, line = self._decode(commands, task)
-        drawn = self._activate(commands, task.sh_degree, decoding)
-        corrections, weights = self.corrections, self._weights(task)
+        passes, field, corrections = self._activation, self._field, self.corrections
+        smooth, even = self._config.smoothness, self._config.acceleration
+        values, gradients = self.parameters.arrays("value"), self.parameters.arrays("gradient")
+        decodings = self._decode(commands, task, values)
+        now = decodings[0] if decodings else None
+        drawn = self._activate(commands, task.sh_degree, now)
         drawing = self.rasterizer.record(commands, drawn, task.view.camera, self._background, corrections.move)
         image = corrections.expose(commands, drawing.image)
-        terms, d_image = self._losses.record(commands, image, truth, weights)
+        terms, d_image = self._losses.record(commands, image, truth, self._weights(task))
         d_image = corrections.expose_bwd(commands, drawing.image, d_image)
         by_drawn = self.rasterizer.record_bwd(commands, drawing, d_image, camera=corrections.moves_camera)
         corrections.sum_camera(commands, by_drawn.camera)
-        self._record_bwd(commands, drawn, by_drawn, decoding, line)
+        if task.even is not None:
+            scale = even.weight * even.interval / task.even.count
+            line = Line(decodings[0], decodings[1], decodings[2], scale)
+            accelerations = passes.acceleration(commands, line, values, drawn, by_drawn, gradients)
+            self._total(commands, accelerations, "acceleration", line.scale)
+        passes.activate_bwd(commands, values, drawn, by_drawn, now, gradients)
+        if field is not None and now is not None:
+            for each in decodings:
+                field.decode_bwd(commands, each, values, gradients)
+            if task.near is not None:
+                weights = [weight / task.near.count for weight in (smooth.static, smooth.temporal)]
+                near, times = self._of_task("near"), (now.time, self._of_task("near_time"))
+                differences = field.compare(commands, values, gradients, near, times, weights)
+                for name, sums, weight in zip(TOTALS, differences, weights, strict=False):
+                    self._total(commands, sums, name, weight)
+            if self._dynamics_loss:
+                self._dynamics(commands, values.beside, gradients.beside)
         self._record_end(commands, task, drawing, by_drawn, terms)
         return drawing, [self.guard, self._bad, terms, self._totals, *drawing.needed]
 
-    def _decode(self, commands: Commands, task: Task) -> tuple[Decoding | None, Line | None]:
-        """Record the field at a step's time and around it, where the step has these; what varies is asked for anew."""
-        field, values = self._field, self.parameters.arrays("value")
+    def _decode(self, commands: Commands, task: Task, values: FieldArrays) -> list[Decoding]:
+        """Record the field at a step's time, and before and after it where the step has that; what varies is asked for
+        anew."""
+        field = self._field
         if field is None or not task.scheduled.moving:
-            return None, None
-        decoding, line = field.decode(commands, 0, values, lambda: self._task.time), None
+            return []
+        decodings = [field.decode(commands, 0, values, lambda: self._task.time)]
         if task.even is not None:
-            even, config = self._of_task("even"), self._config.acceleration
-            before = field.decode(commands, 3, values, lambda: self._task.even_times[0], even)
-            after = field.decode(commands, 4, values, lambda: self._task.even_times[1], even)
-            line = Line(decoding, before, after, config.weight * config.interval / task.even.count)
-        return decoding, line
+            even = self._of_task("even")
+            decodings.append(field.decode(commands, 3, values, lambda: self._task.even_times[0], even))
+            decodings.append(field.decode(commands, 4, values, lambda: self._task.even_times[1], even))
+        return decodings
 
     def _of_task(self, name: str) -> Callable[[], Any]:
         return lambda: getattr(self._task, name)
@@ -184,34 +201,6 @@ class ResidentPasses:
     def _activate(self, commands: Commands, degree: int, decoding: Decoding | None) -> Gaussians[DeviceArray]:
         values, antialiased = self.parameters.arrays("value"), self._scene.antialiased
         return self._activation.activate(commands, values, degree, decoding, antialiased=antialiased)
-
-    def _record_bwd(
-        self,
-        commands: Commands,
-        drawn: Gaussians[DeviceArray],
-        by_drawn: GaussianGradients,
-        decoding: Decoding | None,
-        line: Line | None,
-    ) -> None:
-        """Record the losses of motion, and the gradients of the parameters from those of what was drawn."""
-        passes, field, smooth = self._activation, self._field, self._config.smoothness
-        values, gradients = self.parameters.arrays("value"), self.parameters.arrays("gradient")
-        if line is not None:
-            accelerations = passes.acceleration(commands, line, values, drawn, by_drawn, gradients)
-            self._total(commands, accelerations, "acceleration", line.scale)
-        passes.activate_bwd(commands, values, drawn, by_drawn, decoding, gradients)
-        if field is None or decoding is None:
-            return
-        for each in (decoding, *(() if line is None else (line.before, line.after))):
-            field.decode_bwd(commands, each, values, gradients)
-        if self._task.near is not None:
-            weights = [weight / self._task.near.count for weight in (smooth.static, smooth.temporal)]
-            near, times = self._of_task("near"), (decoding.time, self._of_task("near_time"))
-            differences = field.compare(commands, values, gradients, near, times, weights)
-            for total, sums, weight in zip(TOTALS, differences, weights, strict=False):
-                self._total(commands, sums, total, weight)
-        if self._dynamics_loss:
-            self._dynamics(commands, values.beside, gradients.beside)
 
     def _total(self, commands: Commands, values: DeviceArray, name: str, factor: float) -> None:
         """Record the sum of values, times a factor, in the place of this name."""
@@ -235,10 +224,9 @@ class ResidentPasses:
         self, commands: Commands, task: Task, drawing: Drawing, by_drawn: GaussianGradients, terms: DeviceArray
     ) -> None:
         """Record whether the step may change anything, and what it changes."""
-        moving, count, guard = task.scheduled.moving, len(self._scene), self.guard
-        self.parameters.record_check(commands, self._bad, moving=moving)
-        self.corrections.record_check(commands, self._bad)
-        check_finite(commands, self._pool, terms, self._bad)
+        count, guard = len(self._scene), self.guard
+        for values in (*self.parameters.gradients(), *self.corrections.gradients(), terms):
+            check_finite(commands, self._pool, values, self._bad)
         close = Kernel.get(self._device, "close_guard")
         given = {"capacity": drawing.plan.capacity, "rounds": int(bool(self.rasterizer.config.round_splats))}
         guarded = self._pool.varying(
@@ -252,6 +240,6 @@ class ResidentPasses:
             arrays = {"splats": drawing.splats, "d_splats": by_drawn.splats, "statistics": self.seen()}
             seen = self._pool.constant(content)
             commands.dispatch(kernel, -(-count // 64), seen=seen, guard=guard, **arrays)
-        self.parameters.record_adam(commands, guard, moving=moving)
+        self.parameters.record_adam(commands, guard)
         geometry = self.parameters.blocks["geometry"].arrays["value"]
         self.corrections.record_step(commands, guard, drawing.arrays["frame"], geometry)

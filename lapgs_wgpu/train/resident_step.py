@@ -82,19 +82,14 @@ class ResidentStep:
         tensors = [torch.from_numpy(array) for array in read_all(list(now.arrays().values()))]
         return Gaussians(*tensors, antialiased=now.antialiased)
 
-    def settle(self) -> None:
-        """Wait for all steps."""
-        while self._flying:
-            self._settle_first()
-
-    def make_room(self) -> None:
-        """Wait until one more step may be in flight. Nothing may have been drawn for it yet."""
-        while len(self._flying) >= IN_FLIGHT:
+    def settle(self, left: int = 0) -> None:
+        """Wait until no more than `left` steps are in flight."""
+        while len(self._flying) > left:
             self._settle_first()
 
     def take(self, scheduled: Scheduled, began: Callable[[], None]) -> Callable[[], Measured]:
-        """Submit a step, after `make_room`; gives what it will have told, for which that waits. began: called when it
-        is submitted."""
+        """Submit a step, which at most IN_FLIGHT - 1 are in flight before; gives what it will have told, for which
+        that waits. began: called when it is submitted."""
         task = self._task(scheduled)
         self._flying.append(self._submit(task))
         began()

@@ -32,6 +32,11 @@ class TimingRefinement:
     it. gap: the usual distance in time of two images of a camera.
     """
 
+    summary = (  # of `report`
+        "the times of the training images were corrected by {frames:.2f} of the distance of two images (root mean "
+        "square; at most {frames_most:.2f})."
+    )
+
     def __init__(
         self,
         scene: Scene4D,
@@ -52,8 +57,8 @@ class TimingRefinement:
             return timing.moments
         return np.array([timing(t) for t in self._times.tolist()])
 
-    def fitted(self, number: int) -> NDArray[np.float64]:
-        """(T,) all field times a step on. number: of the step, from 0 on: of several views of a time, it takes one.
+    def fitted(self, number: int) -> Timing:
+        """The timing a step on. number: of the step, from 0 on: of several views of a time, it takes one.
 
         The same bits on every run of one adapter and driver. Raises InputError where an image cannot be read.
         """
@@ -66,11 +71,8 @@ class TimingRefinement:
         moved = before + self._gap * shifts.clip(-LARGEST_SHIFT, LARGEST_SHIFT)
         farthest = FARTHEST * self._gap
         moved = np.clip(moved, self._times - farthest, self._times + farthest)
-        return np.maximum.accumulate(np.clip(moved, 0.0, 1.0))
-
-    def set(self, field_times: NDArray[np.float64]) -> None:
-        """Give the scene its timing. field_times: (T,), never descending."""
-        self._scene.timing = EVEN if (field_times == self._times).all() else Timing(self._times, field_times)
+        moved = np.maximum.accumulate(np.clip(moved, 0.0, 1.0))
+        return EVEN if (moved == self._times).all() else Timing(self._times, moved)
 
     def _fit(self, view: View, now: float) -> tuple[float, float]:
         """How much later the field time is that fits a view best, in gaps between images; and the share of the view's
@@ -89,14 +91,6 @@ class TimingRefinement:
         """Differences of field times from image times: root mean square and largest, in gaps between images."""
         differences = np.abs(self._field_times - self._times) / self._gap
         return {"frames": float(np.sqrt(np.mean(differences**2))), "frames_most": float(differences.max())}
-
-    def summary(self) -> str:
-        """How far the times went, in a sentence."""
-        report = self.report()
-        return (
-            f"the times of the training images were corrected by {report['frames']:.2f} of the distance of two images "
-            f"(root mean square; at most {report['frames_most']:.2f})."
-        )
 
 
 def running_median(values: NDArray[np.float64], around: int) -> NDArray[np.float64]:

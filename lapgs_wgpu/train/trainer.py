@@ -27,7 +27,7 @@ from lapgs_wgpu.train.ground_truth import Draws, GroundTruth, backgrounds_of
 from lapgs_wgpu.train.host import step_threads, torch_threads
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.parts import Parts
-from lapgs_wgpu.train.resident_step import ResidentStep
+from lapgs_wgpu.train.resident_step import IN_FLIGHT, ResidentStep
 from lapgs_wgpu.train.setup import Start, set_up, start_from_points, why_exchange
 from lapgs_wgpu.train.step_result import Measured, Scheduled, StepResult
 from lapgs_wgpu.train.timing_refinement import TimingRefinement
@@ -92,13 +92,13 @@ class Trainer:
         self.done = 0
         self.scene, self.discovery, self.discovery_seconds = start.scene, start.summary, start.seconds
         self.warm_up_steps, self._ramp_steps = start.warm_up_steps, start.ramp_steps
-        self._generator = torch.Generator().manual_seed(config.seed)
+        generator = torch.Generator().manual_seed(config.seed)
         config, scene, dataset = self.config, self.scene, self.dataset
         backgrounds = backgrounds_of(dataset.train, config.data)
         self._truth = GroundTruth(scene.device, backgrounds, int(config.data.cache_gb * 1e9))
-        self._draws = Draws(dataset.train, self._generator, self._truth)
+        self._draws = Draws(dataset.train, generator, self._truth)
         self._learners = Learners(config, dataset, self.parts, start)
-        self._density = DensityControl(self._learners, self._generator)
+        self._density = DensityControl(self._learners, generator)
         self.timing = None
         if config.timing.refine and scene.field is not None and len(dataset.times) > 2:
             self.timing = TimingRefinement(scene, dataset.train, self._truth.on_host, self._picture, dataset.time_gap)
@@ -148,11 +148,8 @@ class Trainer:
     def evaluate(self, views: Sequence[View] | None = None) -> dict[str, Any]:
         """Measure the scene on views, the test views where None: the content of metrics.json (docs/metrics.md).
         Training views are seen by their corrected cameras."""
-        trained, chosen = set(self.dataset.cameras), self.dataset.test if views is None else views
-        seen = [
-            dataclasses.replace(view, camera=self._learners.camera(view)) if view.camera in trained else view
-            for view in chosen
-        ]
+        chosen = self.dataset.test if views is None else views
+        seen = [dataclasses.replace(view, camera=self._learners.camera(view)) for view in chosen]
         return evaluate(self.scene, seen, self.config.data.background)
 
     def psnr(self, views: Sequence[View]) -> float:
@@ -193,10 +190,10 @@ class Trainer:
         moving, share = step > self.warm_up_steps, self._share_of_rates(step)
         # Before this step draws: both may wait for steps in flight, which may draw again.
         if self._resident is not None:
-            self._resident.make_room()
-        field_times, corrections = None, self.config.timing.corrections(self.config.schedule.steps)
+            self._resident.settle(IN_FLIGHT - 1)
+        timing, corrections = self.scene.timing, self.config.timing.corrections(self.config.schedule.steps)
         if self.timing is not None and moving and step in corrections:
-            field_times = self.timing.fitted(corrections.index(step))
+            timing = self.timing.fitted(corrections.index(step))
         before = self._draws.mark()
         try:
             scheduled = Scheduled(step, moving, share, step < self.config.density.stop)
@@ -205,8 +202,7 @@ class Trainer:
             if self.whole:  # the device gave out, or somebody broke it off: as if not begun
                 self._draws.go_back(before)
             raise
-        if self.timing is not None and field_times is not None:
-            self.timing.set(field_times)
+        self.scene.timing = timing
         self._density.change(step, moving=moving)
         if step % self.config.schedule.sh_interval == 0:
             self.scene.sh_degree = min(self.scene.sh_degree + 1, MAX_SH_DEGREE)
@@ -263,7 +259,7 @@ class Trainer:
                 "rising": torch.tensor(self._ramp_steps),
                 "field_fitted": torch.tensor(self._learners.field_fitted, dtype=torch.float64),
                 "sh_degree": torch.tensor(scene.sh_degree),
-                "random": self._generator.get_state(),
+                "random": self._draws.generator.get_state(),
                 "order": torch.tensor(self._draws.left, dtype=torch.int64),
                 "bands": torch.tensor(self._plans.bands(self._drawn)),
             },
@@ -298,6 +294,5 @@ class Trainer:
         self.done, scene.sh_degree = int(own["done"]), int(own["sh_degree"])
         self.warm_up_steps, self._ramp_steps = int(own["warm_up"]), int(own["rising"])
         self._learners.set_field_fitted(float(own["field_fitted"]))
-        self._generator.set_state(own["random"])
-        self._draws.left = own["order"].tolist()
+        self._draws.go_back((own["random"], own["order"].tolist()))
         self._plans.set_bands(self._drawn, int(own["bands"]))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.train.config import LossWeights
-from lapgs_wgpu.train.fused_loss import RenderLoss, render_loss
+from lapgs_wgpu.train.exchange_step import RenderLoss, render_loss
 from lapgs_wgpu.train.ground_truth import upload_rgba
 
 WEIGHTS = {
