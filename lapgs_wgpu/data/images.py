@@ -73,7 +73,7 @@ class ImageFile(NamedTuple):
         """Decode the image and shrink it to (width, height): see `decode`. Raises InputError."""
         image = decode(self.path)
         if self.upright:
-            image = _turned(image, self.orientation)
+            image = oriented(image, self.orientation)
         if image.shape[1::-1] != self.size:
             raise InputError(
                 f"{self.path} is {size_text(image.shape[1::-1])} pixels now and was {size_text(self.size)} when the "
@@ -84,12 +84,16 @@ class ImageFile(NamedTuple):
     @property
     def turned(self) -> "ImageFile":
         """The same file, read as its orientation says."""
-        size = self.size[::-1] if self.orientation >= SIDEWAYS else self.size
-        return self._replace(size=size, upright=True)
+        return self._replace(size=oriented_size(self.size, self.orientation), upright=True)
 
 
-def _turned(image: Pixels, orientation: int) -> Pixels:
-    """An image (H, W, C) as EXIF's orientation, 1 to 8, shows it."""
+def oriented_size(size: Size, orientation: int) -> Size:
+    """(width, height) as EXIF's orientation, 1 to 8, shows it."""
+    return size[::-1] if orientation >= SIDEWAYS else size
+
+
+def oriented(image: NDArray[Any], orientation: int) -> NDArray[Any]:
+    """An image (H, W, ...) as EXIF's orientation, 1 to 8, shows it."""
     if orientation >= SIDEWAYS:
         image = image.swapaxes(0, 1)
     rows = -1 if orientation in (3, 4, 7, 8) else 1
@@ -102,19 +106,14 @@ def check_image(path: Path, *, whole: bool = True) -> ImageFile:
 
     whole: also read every byte (of a PNG, verify each checksum); no pixel is decoded.
     """
-    try:
-        with Image.open(path, formats=_FORMATS) as file:
-            size, mode = file.size, file.mode
-            exif = file.format != "PNG" or "exif" in file.info  # else Pillow would decode a PNG to look for more
-            orientation = file.getexif().get(_ORIENTATION, 1) if exif else 1
-            deep = file.format == "PNG" and "16" in str(file.tile[0][3])
-            alpha = _has_alpha(file)
-            if whole:
-                file.verify()
-    except Image.UnidentifiedImageError:
-        raise InputError(f"{path} {_content(path)}") from None
-    except _ERRORS as reason:
-        raise InputError(f"{path} is not a readable image ({reason}); copy or render it again.") from None
+    with _decoding(path), Image.open(path, formats=_FORMATS) as file:
+        size, mode = file.size, file.mode
+        exif = file.format != "PNG" or "exif" in file.info  # else Pillow would decode a PNG to look for more
+        orientation = file.getexif().get(_ORIENTATION, 1) if exif else 1
+        deep = file.format == "PNG" and "16" in str(file.tile[0][3])
+        alpha = _has_alpha(file)
+        if whole:
+            file.verify()
     if mode not in _MODES:
         raise InputError(f"{path} has pixels of mode {mode}; save it as RGB or RGBA with 8 bits per channel.")
     return ImageFile(path, size, orientation if orientation in range(1, 9) else 1, deep, alpha)
@@ -215,8 +214,10 @@ def check_film(images: Sequence[Path]) -> list[str]:
 def _decoding(path: Path) -> Iterator[None]:
     try:
         yield
+    except Image.UnidentifiedImageError:
+        raise InputError(f"{path} {_content(path)}") from None
     except _ERRORS as error:
-        raise InputError(f"{path} cannot be decoded as an image ({error}); copy or render it again.") from None
+        raise InputError(f"{path} is not a readable image ({error}); copy or render it again.") from None
 
 
 def encode_png(image: Pixels, *, level: int = 6) -> bytes:

@@ -8,16 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.images import THUMBNAIL, Pixels, Size, shrunk_size, size_text
-from lapgs_wgpu.data.video_frames import (
-    EXACT_COLORS,
-    INTERLACED,
-    Display,
-    display,
-    import_av,
-    opened_film,
-    pixel_aspect,
-)
+from lapgs_wgpu.data.images import THUMBNAIL, Pixels, Size, oriented, oriented_size, shrunk_size, size_text
+from lapgs_wgpu.data.video_frames import EXACT_COLORS, INTERLACED, import_av, opened_film, orientation, pixel_aspect
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.hdr import TRANSFERS, to_sdr
 from lapgs_wgpu.progress import say
@@ -37,13 +29,13 @@ class Frame(NamedTuple):
     exif: bytes = b""
 
 
-def _pixels(frame: Any, size: Size, shape: Display, longer_side: int) -> Pixels:
+def _pixels(frame: Any, size: Size, turned: int, longer_side: int) -> Pixels:
     """size: of the frame's square pixels, not yet turned."""
     width, height = shrunk_size(size, longer_side)
     transfer = TRANSFERS.get(int(frame.color_trc))
     form = "rgb24" if transfer is None else "rgb48le"
     image = frame.to_ndarray(format=form, width=width, height=height, interpolation=EXACT_COLORS)
-    return shape.apply(image if transfer is None else to_sdr(image, transfer))
+    return oriented(image if transfer is None else to_sdr(image, transfer), turned)
 
 
 class Film:
@@ -69,7 +61,7 @@ class Film:
         if first is None:
             raise InputError(f"{path} has no frame that can be decoded; give the recording itself.")
         self._began = first.time or 0.0
-        self.size: Size = display(first).size(_squared((first.width, first.height), self._aspect))
+        self.size: Size = oriented_size(_squared((first.width, first.height), self._aspect), orientation(first))
         if first.interlaced_frame:
             say(f"{path}: {INTERLACED}.")
 
@@ -81,9 +73,9 @@ class Film:
         with opened_film(self.path) as (file, stream):
             try:
                 for frame in file.decode(stream):
-                    shape = display(frame)
+                    turned = orientation(frame)
                     shown = _squared((frame.width, frame.height), self._aspect)
-                    size = shape.size(shown)
+                    size = oriented_size(shown, turned)
                     if size != self.size:
                         raise InputError(
                             f"{self.path}: frame {number} has {size_text(size)} pixels and the first has "
@@ -95,7 +87,9 @@ class Film:
                     seconds = max(seconds, 0.0)
                     if seconds >= self.start - 0.5 / self.rate:
                         begin = seconds if begin is None else begin
-                        yield Frame(seconds - begin, _gray(frame, shown, shape), partial(_pixels, frame, shown, shape))
+                        yield Frame(
+                            seconds - begin, _gray(frame, shown, turned), partial(_pixels, frame, shown, turned)
+                        )
                     number, last = number + 1, seconds
             except av.error.FFmpegError:
                 if number < 2:
@@ -115,7 +109,7 @@ def _squared(coded: Size, aspect: float) -> Size:
     return max(1, round(coded[0] * aspect)), coded[1]
 
 
-def _gray(frame: Any, size: Size, shape: Display) -> NDArray[np.float32]:
+def _gray(frame: Any, size: Size, turned: int) -> NDArray[np.float32]:
     width, height = shrunk_size(size, THUMBNAIL)
     small = frame.to_ndarray(format="gray", width=width, height=height, interpolation=_FAST_BILINEAR)
-    return shape.apply(small).astype(np.float32)
+    return oriented(small, turned).astype(np.float32)
