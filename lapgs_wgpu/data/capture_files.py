@@ -54,19 +54,15 @@ class CaptureFiles:
         for key in ("/".join(parts[start:]) for start in starts):
             images = _SMALLER.match(key)
             gone = images is not None and not os.path.isdir(self.folder / images[0])
-            if found := self._by_name.get(key) or (self._smaller.get(_in_images(key)) if gone else None):
+            if found := self._by_name.get(key) or (self._by_name.get(_of_any_size(key)) if gone else None):
                 return found
         return self.find(unquote(name)) if unquote(name) != name else None
 
     @cached_property
     def _by_name(self) -> dict[str, str]:
-        """The files by their folded names."""
-        return {_folded(path): path for path in reversed(files_below(self.folder))}
-
-    @cached_property
-    def _smaller(self) -> dict[str, str]:
-        """The same, with images for images_4."""
-        return {_in_images(name): path for name, path in self._by_name.items()}
+        """The files by their folded names, and by those for images of any size."""
+        names = {_folded(path): path for path in reversed(files_below(self.folder))}
+        return {_of_any_size(name): path for name, path in names.items()} | names
 
     def find_image(self, name: str, named: str) -> str | None:
         """As `find`, of an image, whose name may lack the suffix. If there is none, a sentence goes to `absent`. named:
@@ -126,8 +122,9 @@ def _leads_out(name: str) -> bool:
     )
 
 
-def _in_images(name: str) -> str:
-    return _SMALLER.sub(r"\1images/", name)
+def _of_any_size(name: str) -> str:
+    """A name with two slashes, as no file has, for images/ and images_4/."""
+    return _SMALLER.sub(r"\1/", name)
 
 
 def _folded(name: str) -> str:

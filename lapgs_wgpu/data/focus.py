@@ -5,10 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.cloud import in_view
+from lapgs_wgpu.data.cloud import Array, in_view
 from lapgs_wgpu.splat.camera import Camera
-
-Array = NDArray[np.float64]
 
 ROUNDING = 1e-9  # relative to coordinates: what tells them apart by less is no distance
 PARALLEL = 1e-2  # mean squared sine between optical axes below which they do not determine a point

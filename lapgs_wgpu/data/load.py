@@ -84,24 +84,23 @@ def load_dataset(
     capture = dataclasses.replace(capture, frames=frames, cloud=cloud)
     fit, cloud, depths = place(capture, cameras, moving, warnings)
     whole = fit if fit is None or capture.moved is None else capture.moved.then(fit)
-    placed = {camera: fit.camera(camera) if fit else camera for camera in {view.camera for view in views}}
     # Without a cloud, what stands just before one camera would explain its images alone, and block those beside it.
-    if depths is not None and cloud is None:
-        near = NEAR_SHARE * depths[0]
-        placed = {camera: dataclasses.replace(seen, near=near) for camera, seen in placed.items()}
-    order = _by_film(frames, warnings) if capture.own_footage else range(len(frames))
-
-    def of_split(split: Split) -> tuple[View, ...]:
-        chosen = [i for i in order if frames[i].split == split]
-        names = [f"{split}_{frames[i].label or f'{number:05d}'}" for number, i in enumerate(chosen)]
-        found = zip(names, chosen, strict=True)
-        return tuple(dataclasses.replace(views[i], name=name, camera=placed[views[i].camera]) for name, i in found)
+    near = NEAR_SHARE * depths[0] if depths is not None and cloud is None else 0.0
+    placed = {
+        camera: dataclasses.replace(camera, T_cam_world=fit.pose(camera.T_cam_world) if fit else T, near=near)
+        for camera, T in {view.camera: view.camera.T_cam_world for view in views}.items()
+    }
+    found: dict[Split | None, list[View]] = {"train": [], "test": [], "val": []}
+    for i in _by_film(frames, warnings) if capture.own_footage else range(len(frames)):
+        split, label, camera = frames[i].split, frames[i].label, placed[views[i].camera]
+        name = f"{split}_{label or f'{len(found[split]):05d}'}"
+        found[split].append(dataclasses.replace(views[i], name=name, camera=camera))
 
     return Dataset(
         folder.resolve().name,
-        of_split("train"),
-        of_split("test"),
-        val=of_split("val"),
+        tuple(found["train"]),
+        tuple(found["test"]),
+        val=tuple(found["val"]),
         cloud=cloud,
         depths=depths,
         normalization=whole,

@@ -18,13 +18,12 @@ from PIL import Image
 from scipy import ndimage, sparse
 from scipy.sparse.linalg import spsolve
 
-from lapgs_wgpu.data.cloud import points_at
+from lapgs_wgpu.data.cloud import Array, points_at
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.views import Dataset, small_views
 from lapgs_wgpu.progress import counted, say
 from lapgs_wgpu.splat.camera import Camera
 
-Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
 SIDE = 128  # pixels, of the images that are compared

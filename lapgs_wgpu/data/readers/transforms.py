@@ -13,7 +13,7 @@ from lapgs_wgpu.data.capture_files import CaptureFiles
 from lapgs_wgpu.data.cloud import find_cloud, is_random, read_cloud
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import SIDEWAYS, ImageFile
-from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, LARGEST_SIDE, Fields, number, read_json
+from lapgs_wgpu.data.json_fields import FINITE, LARGEST_INTRINSIC, LARGEST_SIDE, Fields, read_json
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.poses import opengl_pose
 from lapgs_wgpu.data.stamps import ImageName, image_names
@@ -42,7 +42,7 @@ def _read_frames(data: Fields, files: CaptureFiles, time: str) -> dict[int, Fram
             raise InputError(
                 f"{entry.where} has no field {time}, though {timed} of {len(entries)} frames have it; give it for all."
             )
-        stated = number(entry.values[time], time, entry.where) if timed else None
+        stated = entry.number(time, *FINITE) if timed else None
         pose = opengl_pose(entry.required("transform_matrix"), entry.where)
         if found := files.image(entry, "file_path"):
             name, image = found
