@@ -4,7 +4,7 @@ import os
 import re
 import unicodedata
 from functools import cached_property
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path, PureWindowsPath
 from urllib.parse import unquote
 
 from lapgs_wgpu.data.images import SUFFIXES, ImageFile, check_image
@@ -18,8 +18,7 @@ _SMALLER = re.compile(r"(.*/)?images(_\d+)?/")  # folders of smaller images, as 
 
 
 def files_below(folder: Path) -> list[str]:
-    """Return the paths of all files below a folder but the desktop's, relative to it, with slashes, in natural order.
-    Folders may be links; each is entered once."""
+    """The files below a folder but the desktop's, in natural order: relative paths with slashes. Links are followed."""
     found: list[str] = []
     entered: set[str] = set()
     for parent, folders, names in os.walk(folder, followlinks=True):
@@ -116,10 +115,8 @@ class CaptureFiles:
 
 def _leads_out(name: str) -> bool:
     """Whether a path leads out of any folder, on any system."""
-    return any(
-        system(name).anchor or ".." in system(os.path.normpath(name)).parts
-        for system in (PurePosixPath, PureWindowsPath)
-    )
+    of_windows = PureWindowsPath(name), PureWindowsPath(os.path.normpath(name))  # which takes both slashes
+    return bool(of_windows[0].anchor) or ".." in of_windows[1].parts
 
 
 def _of_any_size(name: str) -> str:

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import imageio.v3 as iio
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import ExifTags, Image
 
 from lapgs_wgpu.data.evenly import some
 from lapgs_wgpu.errors import InputError
@@ -39,7 +39,6 @@ _OTHERS = re.compile(  # first bytes of other formats
     rb"|(?P<BMP>BM)|(?P<OpenEXR>\x76\x2f\x31\x01)|(?P<JPEG_XL>\xff\x0a|.{4}JXL )",
     re.DOTALL,
 )
-_ORIENTATION = 0x0112  # EXIF's tag
 SIDEWAYS = 5  # orientations from this one on exchange width and height
 
 THUMBNAIL = 320  # longer side, pixels: what is blurred or equal at this size is so for a training, too
@@ -75,10 +74,8 @@ class ImageFile(NamedTuple):
         if self.upright:
             image = oriented(image, self.orientation)
         if image.shape[1::-1] != self.size:
-            raise InputError(
-                f"{self.path} is {size_text(image.shape[1::-1])} pixels now and was {size_text(self.size)} when the "
-                "capture was opened; put the image back."
-            )
+            sizes = f"{size_text(image.shape[1::-1])} pixels now and was {size_text(self.size)} when it was opened"
+            raise InputError(f"{self.path} is {sizes}; put the image back.")
         return shrink(image, size)
 
     @property
@@ -109,7 +106,7 @@ def check_image(path: Path, *, whole: bool = True) -> ImageFile:
     with _decoding(path), Image.open(path, formats=_FORMATS) as file:
         size, mode = file.size, file.mode
         exif = file.format != "PNG" or "exif" in file.info  # else Pillow would decode a PNG to look for more
-        orientation = file.getexif().get(_ORIENTATION, 1) if exif else 1
+        orientation = file.getexif().get(ExifTags.Base.Orientation, 1) if exif else 1
         deep = file.format == "PNG" and "16" in str(file.tile[0][3])
         alpha = _has_alpha(file)
         if whole:

@@ -97,8 +97,7 @@ class Lens:
         if not covered(high):
             values = ", ".join(f"{value:.3g}" for value in (*self.radial, *self.tangential))
             raise InputError(
-                f"{where}: its distortion ({values}) bends the image so much that enlarging it {MAX_ZOOM:g} times "
-                "leaves gaps; check the coefficients."
+                f"{where}: its distortion ({values}) leaves gaps even in an image {MAX_ZOOM:g} times as big; check it."
             )
         for _ in range(20):
             middle = (low + high) / 2

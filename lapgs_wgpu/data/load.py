@@ -15,6 +15,7 @@ from lapgs_wgpu.data.lens import Lens, Undistortion
 from lapgs_wgpu.data.masks import MOSTLY, check_masks, find_masks, read_mask
 from lapgs_wgpu.data.normalize import Normalization
 from lapgs_wgpu.data.placement import mover_cube, place
+from lapgs_wgpu.data.poses import place_of
 from lapgs_wgpu.data.readers import apps, colmap, hypernerf, panoptic, poses_bounds, transforms
 from lapgs_wgpu.data.stamps import by_camera, natural_key
 from lapgs_wgpu.data.timestamps import as_one_camera, disorder, held_out, in_step, read_times
@@ -162,7 +163,7 @@ def _timed(folder: Path, capture: Capture, frames: Sequence[Frame], warnings: li
     if not times:
         times, source = read_times(names, folder)
     if capture.own_footage:
-        names = as_one_camera(names, times, [frame.place for frame in frames])
+        names = as_one_camera(names, times, [place_of(frame.T_cam_world) for frame in frames])
         warnings += disorder(names, times)
         times = in_step(names, times)
     first, last = capture.time_range or (min(times), max(times))
@@ -217,19 +218,16 @@ def _views(frames: Sequence[Frame], size: Size, *, shared: bool) -> list[View]:
         if key not in cameras:
             K, taken = (lens.K, lens.size) if lens.is_pinhole else (undistortion.K, stored)
             cameras[key] = Camera(K, frame.T_cam_world, *taken).resized(*size)
-        load = partial(_pixels, frame.image, undistortion, stored, size)
-        view = View("", cameras[key], frame.time, str(frame.image), load)
-        mask = partial(read_mask, undistortion=undistortion, stored=stored, size=size)
-        if frame.mask is not None and frame.split == "train":
-            view = dataclasses.replace(view, ignored=partial(mask, frame.mask, frame.mask_kind))
-        if frame.moving is not None:
-            view = dataclasses.replace(view, moving=partial(mask, frame.moving, "white", above=MOSTLY))
-        views.append(view)
+        load = partial(_pixels, frame.image, undistortion, size)
+        mask = partial(read_mask, undistortion=undistortion, size=size)
+        ignored = partial(mask, frame.mask, frame.mask_kind) if frame.mask and frame.split == "train" else None
+        moving = partial(mask, frame.moving, "white", above=MOSTLY) if frame.moving else None
+        views.append(View("", cameras[key], frame.time, str(frame.image), load, ignored, moving))
     return views
 
 
-def _pixels(image: ImageFile, undistortion: Undistortion, stored: Size, size: Size) -> Pixels:
-    return shrink(undistortion.apply(image.read(stored)), size)
+def _pixels(image: ImageFile, undistortion: Undistortion, size: Size) -> Pixels:
+    return shrink(undistortion.apply(image.read(undistortion.lens.size)), size)
 
 
 def _by_film(frames: Sequence[Frame], warnings: list[str]) -> list[int]:

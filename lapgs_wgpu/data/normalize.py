@@ -34,16 +34,11 @@ class Normalization(NamedTuple):
 
     def cloud(self, cloud: Cloud) -> Cloud:
         """Transform a cloud."""
-        return Cloud(self.points(cloud.points.astype(np.float64)), cloud.colors).rounded
+        return Cloud(self.points(cloud.points.astype(np.float64)).astype(np.float32), cloud.colors)
 
     def pose(self, T_cam_world: Array) -> Array:
         """Transform a pose (4, 4)."""
         return world_to_camera(T_cam_world[:3, :3].T, self.points(place_of(T_cam_world)))
-
-    def camera(self, camera: Camera) -> Camera:
-        """Transform a camera."""
-        near = self.scale * camera.near
-        return Camera(camera.K, self.pose(camera.T_cam_world), camera.width, camera.height, near)
 
     def then(self, other: "Normalization") -> "Normalization":
         """Compose: this one first, then the other."""

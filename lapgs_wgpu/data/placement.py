@@ -49,7 +49,7 @@ def place(
     if cloud is not None and capture.own_footage:
         cloud = _filled(cloud, cameras)
     if cube is None or (capture.keeps_coordinates and cube.fits):
-        return None, cloud and cloud.rounded, depths
+        return None, cloud and Cloud(cloud.points.astype(np.float32), cloud.colors), depths
     fit = Normalization(cube.center, BOX / cube.half)
     return fit, cloud and fit.cloud(cloud), depths and (depths[0] * fit.scale, depths[1] * fit.scale)
 

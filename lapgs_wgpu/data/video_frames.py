@@ -29,7 +29,6 @@ from lapgs_wgpu.io.atomic import new_folder
 
 # Flags of swscale: bicubic, accurate rounding, chroma interpolated along rows. Its default darkens by 1 or 2 levels.
 EXACT_COLORS = 0x4 | 0x40000 | 0x2000
-COMPRESSION = 1  # of PNG: the next levels take twice as long for a tenth of the bytes
 LARGEST_FRAME = 8192 * 8192  # pixels; the decoder holds several frames
 TURNED = (1, 8, 3, 6), (2, 5, 4, 7)  # EXIF's orientations, by quarter turns counterclockwise; after mirroring
 _ATTACHED_PICTURE = 0x400  # libavformat's flag of a cover image
@@ -87,10 +86,8 @@ def _unpack(path: Path, folder: Path, turned: int, size: Size, wanted: Size) -> 
             for frame in packet.decode():
                 image = oriented(frame.to_ndarray(format="rgb24", interpolation=EXACT_COLORS), turned)
                 if image.shape[1::-1] != size:
-                    raise InputError(
-                        f"{path}: frame {len(written)} has {size_text(image.shape[1::-1])} pixels, and the first "
-                        f"has {size_text(size)}; convert it to one size."
-                    )
+                    sizes = f"{size_text(image.shape[1::-1])} pixels, and the first {size_text(size)}"
+                    raise InputError(f"{path}: frame {len(written)} has {sizes}; convert it to one size.")
                 if len(written) >= 2 * WRITERS:  # the decoder is ahead: bound the frames in memory
                     written[-2 * WRITERS].result()
                 written.append(pool.submit(_write, image, wanted, unfinished / f"{len(written):05d}.png"))
@@ -111,14 +108,12 @@ def opened_film(path: Path) -> Iterator[tuple[Any, Any]]:
             decoded = [each for each in films if each.codec_context is not None]
             if not decoded:
                 raise InputError(
-                    f"{path} has {len(films)} video streams, and PyAV can decode none; give the camera's recording, or "
-                    "convert it to H.264."
+                    f"{path} has {len(films)} video streams, and PyAV can decode none; record or convert it to H.264."
                 )
             stream = max(decoded, key=lambda each: (each.width or 0) * (each.height or 0))
             if not 1 <= stream.width * stream.height <= LARGEST_FRAME:
                 raise InputError(
-                    f"{path} states frames of {stream.width}x{stream.height} pixels; 1 to {LARGEST_FRAME:,} pixels a "
-                    "frame are allowed."
+                    f"{path} states frames of {stream.width}x{stream.height} pixels; 1 to {LARGEST_FRAME:,} are read."
                 )
             stream.thread_type = "AUTO"
             stream.codec_context.options = {"max_pixels": str(LARGEST_FRAME)}  # whatever the header states
@@ -128,8 +123,7 @@ def opened_film(path: Path) -> Iterator[tuple[Any, Any]]:
 
 
 def orientation(frame: Any) -> int:
-    """How a frame is shown, as an orientation of EXIF: by its matrix, whose rotation alone PyAV states, wrongly for
-    mirrored ones."""
+    """EXIF's orientation of a frame: of its matrix, whose rotation alone PyAV states, wrongly for mirrored ones."""
     matrix = frame.side_data.get("DISPLAYMATRIX")
     if matrix is None:
         return TURNED[False][round(frame.rotation / 90) % 4]
@@ -148,7 +142,7 @@ def pixel_aspect(stream: Any) -> float:
 
 def _write(image: Pixels, size: Size, path: Path) -> None:
     image = resize(image, size, LANCZOS)  # the filter of the figures published for Neu3D
-    path.write_bytes(encode_png(image, level=COMPRESSION))
+    path.write_bytes(encode_png(image, level=1))  # the next levels take twice as long for a tenth of the bytes
 
 
 def import_av(path: Path) -> Any:

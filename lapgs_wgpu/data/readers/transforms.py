@@ -15,7 +15,7 @@ from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import SIDEWAYS, ImageFile
 from lapgs_wgpu.data.json_fields import FINITE, LARGEST_INTRINSIC, LARGEST_SIDE, Fields, read_json
 from lapgs_wgpu.data.lens import Lens
-from lapgs_wgpu.data.poses import opengl_pose
+from lapgs_wgpu.data.poses import opengl_pose, place_of
 from lapgs_wgpu.data.stamps import ImageName, image_names
 from lapgs_wgpu.data.validation import check_frames
 from lapgs_wgpu.errors import InputError, shown
@@ -115,7 +115,7 @@ def _read_nerfstudio(folder: Path, image_size: int | None) -> Capture:
                 "train_filenames, val_filenames and test_filenames, and are left out."
             )
         frames = {f: dataclasses.replace(frame, split=splits[f]) for f, frame in frames.items() if f in splits}
-    names = image_names(list(frames), {file: frame.place for file, frame in frames.items()})
+    names = image_names(list(frames), {file: place_of(frame.T_cam_world) for file, frame in frames.items()})
     cloud = files.optional(data, "ply_file_path")
     return Capture(
         [dataclasses.replace(frames[name.file], name=name) for name in names],
