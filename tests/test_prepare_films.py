@@ -13,8 +13,7 @@ from PIL import Image
 from lapgs_wgpu.data.images import oriented, oriented_size
 from lapgs_wgpu.data.video_frames import orientation
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.prepare.film import Film
-from lapgs_wgpu.prepare.hdr import Transfer, to_sdr
+from lapgs_wgpu.prepare.film import Film, Transfer, to_sdr
 from lapgs_wgpu.prepare.images import Picture, extract, extract_in_step, images_per_second
 from lapgs_wgpu.prepare.rig import common_times, shapes_of
 from lapgs_wgpu.prepare.sound import start_together

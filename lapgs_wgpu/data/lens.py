@@ -115,14 +115,13 @@ class Lens:
 
 
 class Undistortion(NamedTuple):
-    """Resamples images of `lens` (at their size) to those of a pinhole camera with intrinsics K (3, 3); those of a
-    pinhole stay as they are."""
+    """Resamples images of `lens`, at its size, to those of a pinhole camera with intrinsics K (3, 3)."""
 
     lens: Lens
     K: Array
 
     def apply(self, image: Pixels) -> Pixels:
-        """Resample an image (H, W, C) bilinearly to the pinhole's, of the same size.
+        """Resample an image (H, W, C) bilinearly to the pinhole's, of the same size; one of a pinhole stays as it is.
 
         Colors weigh by their alpha, so that those of transparent pixels do not bleed into edges.
         """

@@ -128,10 +128,8 @@ def _stills(dataset: Dataset, at: float | None = None) -> list[_Still]:
 
 
 def _sweep(still: _Still, stills: list[_Still], planes: Array, least: float) -> Array:
-    """(H, W) the inverse depth at which the better half of the neighbors sees the same; NaN where none does.
-
-    least: distance of a neighbor, world units.
-    """
+    """(H, W) the inverse depth at which the better half of the neighbors sees the same; NaN where none does. least:
+    distance of a neighbor, world units."""
     apart = [float(np.linalg.norm(other.camera.position - still.camera.position)) for other in stills]
     order = [i for i in np.argsort(apart, kind="stable") if apart[i] > least][:NEIGHBORS]
     if len(order) < 2:
@@ -148,8 +146,7 @@ def _sweep(still: _Still, stills: list[_Still], planes: Array, least: float) -> 
 
 
 def _likeness(still: _Still, others: list[_Still], plane: float) -> Array:
-    """(H, W) mean normalized cross-correlation with the better half of the others at this inverse depth; -1 where
-    fewer than two see it."""
+    """(H, W) mean correlation with the better half of the others at this inverse depth; -1 where fewer than two see."""
     correlations = []
     for other in others:
         there = _carried(other, still.camera, plane)

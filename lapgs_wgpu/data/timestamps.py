@@ -112,8 +112,7 @@ def frame_numbers(names: Sequence[ImageName]) -> list[int]:
             found[i] = frame
             if (before := first.setdefault(frame, file)) != file:
                 raise InputError(
-                    f"{file} has the frame number {frame}, as {before} has; rename one, or put the images of each "
-                    "camera into a folder of their own."
+                    f"{file} has the frame number {frame}, as {before} has; rename one, or give each camera a folder."
                 )
     return found
 

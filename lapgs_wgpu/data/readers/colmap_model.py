@@ -1,7 +1,6 @@
 """Sparse models of COLMAP on disk, text or binary: cameras, images and points3D.
 
-The formats are those of COLMAP's documentation (colmap.github.io/format.html). Binary files are untrusted: a
-declared count reserves no memory.
+Source: colmap.github.io/format.html. Binary files are untrusted: a declared count reserves no memory.
 """
 
 import re
@@ -34,8 +33,7 @@ _NUMBERS = re.compile(r"([-+.\deE\s]|nan|inf)*")
 
 
 class ColmapImage(NamedTuple):
-    """A registered image. name: of its file, relative to the folder of images. T_cam_world: (4, 4) pose, OpenCV's
-    axes. where: file and entry, for errors."""
+    """name: of the file, below the folder of images. T_cam_world: (4, 4), OpenCV's axes. where: for errors."""
 
     name: str
     camera: int

@@ -54,8 +54,7 @@ def _read_rows(path: Path, names: Sequence[str], what: str, axes: Array) -> list
         raise InputError(f"{path} must hold (poses, 17) numbers, got {rows.shape}; write it with LLFF's imgs2poses.py.")
     if len(rows) != len(names):
         raise InputError(
-            f"{path} holds {len(rows)} poses, but there are {len(names)} {what}, {names[0]} to {names[-1]}; each of "
-            "them needs a row, in this order."
+            f"{path} holds {len(rows)} poses for {len(names)} {what}, {names[0]} to {names[-1]}: give a row for each."
         )
     found: list[dict[str, Any]] = []
     for i, (row, name) in enumerate(zip(rows, names, strict=True)):
@@ -93,8 +92,7 @@ def _read_neu3d(folder: Path, image_size: int | None) -> Capture:
     for other in others:
         if len(recordings[other]) != count:
             raise InputError(
-                f"{other} has {len(recordings[other])} frames and {first} has {count}; all cameras must have as many: "
-                "cut them to the same frames."
+                f"{other} has {len(recordings[other])} frames and {first} has {count}; cut all to the same frames."
             )
     frames = []
     for (recording, images), row in zip(recordings.items(), rows, strict=True):
@@ -133,8 +131,7 @@ def _recordings(folder: Path, image_size: int | None) -> dict[Path, list[ImageFi
 
 
 def _images(folder: Path, *, whole: bool = False) -> list[ImageFile]:
-    """Return the images of a folder, by number. whole: of `check_image`; those of a rig may be gigabytes. Raises
-    InputError if there is none."""
+    """The images of a folder, by number. whole: of `check_image`; a rig's may be gigabytes. Raises InputError."""
     files = sorted((f for f in listed(folder) if f.suffix.lower() in SUFFIXES), key=lambda f: natural_key(f.name))
     if not files:
         raise InputError(f"{folder} holds no images (.png or .jpg); extract the camera's frames into it.")

@@ -57,8 +57,7 @@ def _states(entry: Fields, field: str) -> bool:
 
 def read_lens(frame: Fields, shared: Fields, image: ImageFile) -> tuple[Lens, bool]:
     """Return the lens of a frame, and whether size or center are stated; each value is the frame's, else its file's. A
-    missing size is the image's; the focal length is that of camera_angle_x (radians) where fl_x is missing. Raises
-    InputError, also for other lens models."""
+    missing size is the image's, and a missing fl_x that of camera_angle_x (radians). Raises InputError."""
 
     def source(name: str) -> Fields:
         return frame if name in frame else shared
