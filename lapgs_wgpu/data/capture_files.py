@@ -115,12 +115,12 @@ class CaptureFiles:
 
 def _leads_out(name: str) -> bool:
     """Whether a path leads out of any folder, on any system."""
-    of_windows = PureWindowsPath(name), PureWindowsPath(os.path.normpath(name))  # which takes both slashes
-    return bool(of_windows[0].anchor) or ".." in of_windows[1].parts
+    path = PureWindowsPath(name)  # which takes both slashes
+    return bool(path.anchor) or ".." in PureWindowsPath(os.path.normpath(name)).parts
 
 
 def _of_any_size(name: str) -> str:
-    """A name with two slashes, as no file has, for images/ and images_4/."""
+    """A name that no file has, /x or a//x, for images/x and images_4/x or those in a."""
     return _SMALLER.sub(r"\1/", name)
 
 

@@ -46,14 +46,15 @@ def read_cloud(path: Path) -> Cloud:
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
         raise InputError(f"{path} must hold at least one point of 3 numbers, an array of (N, 3), got {points.shape}.")
     points = points.astype(np.float64)  # float32 would round what lies far from the origin, before it is centered
-    colors = np.full(points.shape, 0.5, np.float32) if colors is None else colors
+    cloud = Cloud(points, np.full(points.shape, 0.5, np.float32) if colors is None else colors)
     good = (np.abs(points) <= np.finfo(np.float32).max).all(axis=1)  # false for NaN, too
     if bad := len(points) - int(good.sum()):
         told = f"{path} holds NaN or infinite coordinates in {bad} of {len(points)} points"
         if bad > BAD_SHARE * len(points):
             raise InputError(f"{told}, first in point {good.argmin()}; remove them.")
         print(f"note: {told}, which are left out.", file=sys.stderr)
-    return Cloud(points[good], colors[good])
+        return Cloud(points[good], cloud.colors[good])
+    return cloud
 
 
 def read_points(path: Path) -> tuple[NDArray[np.float64], Floats | None]:

@@ -6,7 +6,7 @@ file in `readers` and a line in READERS.
 
 import dataclasses
 from collections.abc import Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
@@ -87,15 +87,17 @@ def load_dataset(
     whole = fit if fit is None or capture.moved is None else capture.moved.then(fit)
     # Without a cloud, what stands just before one camera would explain its images alone, and block those beside it.
     near = NEAR_SHARE * depths[0] if depths is not None and cloud is None else 0.0
-    placed = {
-        camera: dataclasses.replace(camera, T_cam_world=fit.pose(camera.T_cam_world) if fit else T, near=near)
-        for camera, T in {view.camera: view.camera.T_cam_world for view in views}.items()
-    }
+
+    @cache
+    def placed(camera: Camera) -> Camera:
+        pose = camera.T_cam_world if fit is None else fit.pose(camera.T_cam_world)
+        return dataclasses.replace(camera, T_cam_world=pose, near=near)
+
     found: dict[Split | None, list[View]] = {"train": [], "test": [], "val": []}
     for i in _by_film(frames, warnings) if capture.own_footage else range(len(frames)):
-        split, label, camera = frames[i].split, frames[i].label, placed[views[i].camera]
-        name = f"{split}_{label or f'{len(found[split]):05d}'}"
-        found[split].append(dataclasses.replace(views[i], name=name, camera=camera))
+        mine = found[frames[i].split]
+        name = f"{frames[i].split}_{frames[i].label or f'{len(mine):05d}'}"
+        mine.append(dataclasses.replace(views[i], name=name, camera=placed(views[i].camera)))
 
     return Dataset(
         folder.resolve().name,
@@ -109,7 +111,7 @@ def load_dataset(
         warnings=tuple(warnings),
         time_source=time_source,
         own_footage=capture.own_footage,
-        summary=_summary(reader.name, capture, len(placed), time_source, whole),
+        summary=_summary(reader.name, capture, len({view.camera for view in views}), time_source, whole),
     )
 
 

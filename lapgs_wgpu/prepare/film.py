@@ -41,13 +41,13 @@ class Frame(NamedTuple):
     exif: bytes = b""
 
 
-def _pixels(frame: Any, size: Size, turned: int, longer_side: int) -> Pixels:
+def _pixels(frame: Any, size: Size, turn: int, longer_side: int) -> Pixels:
     """size: of the frame's square pixels, not yet turned."""
     width, height = shrunk_size(size, longer_side)
     transfer = TRANSFERS.get(int(frame.color_trc))
     form = "rgb24" if transfer is None else "rgb48le"
     image = frame.to_ndarray(format=form, width=width, height=height, interpolation=EXACT_COLORS)
-    return oriented(image if transfer is None else to_sdr(image, transfer), turned)
+    return oriented(image if transfer is None else to_sdr(image, transfer), turn)
 
 
 class Film:
@@ -85,9 +85,9 @@ class Film:
         with opened_film(self.path) as (file, stream):
             try:
                 for frame in file.decode(stream):
-                    turned = orientation(frame)
+                    turn = orientation(frame)
                     shown = _squared((frame.width, frame.height), self._aspect)
-                    size = oriented_size(shown, turned)
+                    size = oriented_size(shown, turn)
                     if size != self.size:
                         raise InputError(
                             f"{self.path}: frame {number} has {size_text(size)} pixels and the first has "
@@ -99,9 +99,7 @@ class Film:
                     seconds = max(seconds, 0.0)
                     if seconds >= self.start - 0.5 / self.rate:
                         begin = seconds if begin is None else begin
-                        yield Frame(
-                            seconds - begin, _gray(frame, shown, turned), partial(_pixels, frame, shown, turned)
-                        )
+                        yield Frame(seconds - begin, _gray(frame, shown, turn), partial(_pixels, frame, shown, turn))
                     number, last = number + 1, seconds
             except av.error.FFmpegError:
                 if number < 2:
@@ -121,10 +119,10 @@ def _squared(coded: Size, aspect: float) -> Size:
     return max(1, round(coded[0] * aspect)), coded[1]
 
 
-def _gray(frame: Any, size: Size, turned: int) -> NDArray[np.float32]:
+def _gray(frame: Any, size: Size, turn: int) -> NDArray[np.float32]:
     width, height = shrunk_size(size, THUMBNAIL)
     small = frame.to_ndarray(format="gray", width=width, height=height, interpolation=_FAST_BILINEAR)
-    return oriented(small, turned).astype(np.float32)
+    return oriented(small, turn).astype(np.float32)
 
 
 def to_sdr(image: NDArray[np.uint16], transfer: Transfer) -> Pixels:
