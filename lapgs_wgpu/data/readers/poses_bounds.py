@@ -54,7 +54,8 @@ def _read_rows(path: Path, names: Sequence[str], what: str, axes: Array) -> list
         raise InputError(f"{path} must hold (poses, 17) numbers, got {rows.shape}; write it with LLFF's imgs2poses.py.")
     if len(rows) != len(names):
         raise InputError(
-            f"{path} holds {len(rows)} poses for {len(names)} {what}, {names[0]} to {names[-1]}: give a row for each."
+            f"{path} holds {len(rows)} poses, but there are {len(names)} {what}, {names[0]} to {names[-1]}; each of "
+            "them needs a row, in this order."
         )
     found: list[dict[str, Any]] = []
     for i, (row, name) in enumerate(zip(rows, names, strict=True)):
