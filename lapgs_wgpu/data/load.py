@@ -90,8 +90,7 @@ def load_dataset(
 
     @cache
     def placed(camera: Camera) -> Camera:
-        pose = camera.T_cam_world if fit is None else fit.pose(camera.T_cam_world)
-        return dataclasses.replace(camera, T_cam_world=pose, near=near)
+        return dataclasses.replace(camera if fit is None else fit.camera(camera), near=near)
 
     found: dict[Split | None, list[View]] = {"train": [], "test": [], "val": []}
     for i in _by_film(frames, warnings) if capture.own_footage else range(len(frames)):

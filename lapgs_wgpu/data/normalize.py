@@ -40,6 +40,11 @@ class Normalization(NamedTuple):
         """Transform a pose (4, 4)."""
         return world_to_camera(T_cam_world[:3, :3].T, self.points(place_of(T_cam_world)))
 
+    def camera(self, camera: Camera) -> Camera:
+        """Transform a camera."""
+        near = self.scale * camera.near
+        return Camera(camera.K, self.pose(camera.T_cam_world), camera.width, camera.height, near)
+
     def then(self, other: "Normalization") -> "Normalization":
         """Compose: this one first, then the other."""
         return Normalization(self.center + other.center / self.scale, self.scale * other.scale)
