@@ -10,7 +10,8 @@ import pytest
 from helpers.films import noise_pictures, turn_film, write_film
 from PIL import Image
 
-from lapgs_wgpu.data.video_frames import display
+from lapgs_wgpu.data.images import oriented, oriented_size
+from lapgs_wgpu.data.video_frames import orientation
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.film import Film, Picture, Transfer, extract, images_per_second, to_sdr
 from lapgs_wgpu.prepare.rig import common_times, extract_in_step, shapes_of, start_together
@@ -212,7 +213,7 @@ def test_mirrored_and_turned_films(matrix: tuple[int, ...], shown: Callable[[Any
     """(a, b, c, d) of a display matrix: x' = a x + c y, y' = b x + d y."""
     a, b, c, d = matrix
     values = np.array([a, b, 0, c, d, 0, 0, 0, 1 << 14], np.int32) << 16
-    how = display(SimpleNamespace(side_data={"DISPLAYMATRIX": values.tobytes()}))
+    how = orientation(SimpleNamespace(side_data={"DISPLAYMATRIX": values.tobytes()}))
     image = np.arange(12).reshape(3, 4)
-    np.testing.assert_array_equal(how.apply(image), shown(image))
-    assert how.size((4, 3)) == shown(image).shape[::-1]
+    np.testing.assert_array_equal(oriented(image, how), shown(image))
+    assert oriented_size((4, 3), how) == shown(image).shape[::-1]

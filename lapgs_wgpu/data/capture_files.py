@@ -4,7 +4,7 @@ import os
 import re
 import unicodedata
 from functools import cached_property
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path, PureWindowsPath
 from urllib.parse import unquote
 
 from lapgs_wgpu.data.images import SUFFIXES, ImageFile, check_image
@@ -18,8 +18,7 @@ _SMALLER = re.compile(r"(.*/)?images(_\d+)?/")  # folders of smaller images, as 
 
 
 def files_below(folder: Path) -> list[str]:
-    """Return the paths of all files below a folder but the desktop's, relative to it, with slashes, in natural order.
-    Folders may be links; each is entered once."""
+    """The files below a folder but the desktop's, in natural order: relative paths with slashes. Links are followed."""
     found: list[str] = []
     entered: set[str] = set()
     for parent, folders, names in os.walk(folder, followlinks=True):
@@ -54,19 +53,15 @@ class CaptureFiles:
         for key in ("/".join(parts[start:]) for start in starts):
             images = _SMALLER.match(key)
             gone = images is not None and not os.path.isdir(self.folder / images[0])
-            if found := self._by_name.get(key) or (self._smaller.get(_in_images(key)) if gone else None):
+            if found := self._by_name.get(key) or (self._by_name.get(_of_any_size(key)) if gone else None):
                 return found
         return self.find(unquote(name)) if unquote(name) != name else None
 
     @cached_property
     def _by_name(self) -> dict[str, str]:
-        """The files by their folded names."""
-        return {_folded(path): path for path in reversed(files_below(self.folder))}
-
-    @cached_property
-    def _smaller(self) -> dict[str, str]:
-        """The same, with images for images_4."""
-        return {_in_images(name): path for name, path in self._by_name.items()}
+        """The files by their folded names, and by those for images of any size."""
+        names = {_folded(path): path for path in reversed(files_below(self.folder))}
+        return {_of_any_size(name): path for name, path in names.items()} | names
 
     def find_image(self, name: str, named: str) -> str | None:
         """As `find`, of an image, whose name may lack the suffix. If there is none, a sentence goes to `absent`. named:
@@ -120,14 +115,13 @@ class CaptureFiles:
 
 def _leads_out(name: str) -> bool:
     """Whether a path leads out of any folder, on any system."""
-    return any(
-        system(name).anchor or ".." in system(os.path.normpath(name)).parts
-        for system in (PurePosixPath, PureWindowsPath)
-    )
+    path = PureWindowsPath(name)  # which takes both slashes
+    return bool(path.anchor) or ".." in PureWindowsPath(os.path.normpath(name)).parts
 
 
-def _in_images(name: str) -> str:
-    return _SMALLER.sub(r"\1images/", name)
+def _of_any_size(name: str) -> str:
+    """A name that no file has, /x or a//x, for images/x and images_4/x or those in a."""
+    return _SMALLER.sub(r"\1/", name)
 
 
 def _folded(name: str) -> str:

@@ -27,11 +27,6 @@ class Cloud(NamedTuple):
     points: NDArray[Any]
     colors: NDArray[np.float32]
 
-    @property
-    def rounded(self) -> "Cloud":
-        """The same cloud with float32 points."""
-        return Cloud(self.points.astype(np.float32), self.colors)
-
     def at_most(self, count: int, seed: int) -> "Cloud":
         """Return at most `count` points: all of them, or a random subset in their order."""
         if len(self.points) <= count:
@@ -51,15 +46,15 @@ def read_cloud(path: Path) -> Cloud:
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
         raise InputError(f"{path} must hold at least one point of 3 numbers, an array of (N, 3), got {points.shape}.")
     points = points.astype(np.float64)  # float32 would round what lies far from the origin, before it is centered
-    bad = np.flatnonzero(~(np.abs(points) <= np.finfo(np.float32).max).all(axis=1))  # true for NaN, too
     cloud = Cloud(points, np.full(points.shape, 0.5, np.float32) if colors is None else colors)
-    if not len(bad):
-        return cloud
-    told = f"{path} holds NaN or infinite coordinates in {len(bad)} of {len(points)} points"
-    if len(bad) > BAD_SHARE * len(points):
-        raise InputError(f"{told}, first in point {bad[0]}; remove them.")
-    print(f"note: {told}, which are left out.", file=sys.stderr)
-    return Cloud(np.delete(cloud.points, bad, axis=0), np.delete(cloud.colors, bad, axis=0))
+    good = (np.abs(points) <= np.finfo(np.float32).max).all(axis=1)  # false for NaN, too
+    if bad := len(points) - int(good.sum()):
+        told = f"{path} holds NaN or infinite coordinates in {bad} of {len(points)} points"
+        if bad > BAD_SHARE * len(points):
+            raise InputError(f"{told}, first in point {good.argmin()}; remove them.")
+        print(f"note: {told}, which are left out.", file=sys.stderr)
+        return Cloud(points[good], cloud.colors[good])
+    return cloud
 
 
 def read_points(path: Path) -> tuple[NDArray[np.float64], Floats | None]:

@@ -5,14 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.cloud import in_view
+from lapgs_wgpu.data.cloud import Array, in_view
 from lapgs_wgpu.splat.camera import Camera
 
-Array = NDArray[np.float64]
-
-ROUNDING = 1e-9  # relative to coordinates: what tells them apart by less is no distance
 PARALLEL = 1e-2  # mean squared sine between optical axes below which they do not determine a point
-ITERATIONS = 20  # of the reweighted least squares
 FAR_APART = 30.0  # degrees between neighbouring still cameras, beyond which none confirms another one's depths
 
 
@@ -20,7 +16,7 @@ def spread(cameras: Sequence[Camera]) -> float:
     """The largest distance of a camera from the mean of all; 0 where rounding alone tells their places apart."""
     positions = np.stack([camera.position for camera in cameras])
     largest = float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).max())
-    return largest if largest > ROUNDING * np.abs(positions).max() else 0.0
+    return largest if largest > 1e-9 * np.abs(positions).max() else 0.0
 
 
 def are_parallel(cameras: Sequence[Camera]) -> bool:
@@ -35,8 +31,7 @@ def directions(cameras: Sequence[Camera], focus: NDArray[np.floating]) -> Array:
 
 
 def degrees_apart(cameras: Sequence[Camera], focus: NDArray[np.floating]) -> float:
-    """The angle between a camera and the nearest other one, seen from what they look at (3,): the median over them; 0
-    for one camera."""
+    """The median angle between a camera and the nearest other one, seen from what they look at (3,); 0 of one."""
     rays = directions(cameras, focus)
     nearest = np.sort(np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1))), axis=1)[:, 1:2]
     return float(np.median(nearest)) if nearest.size else 0.0
@@ -58,7 +53,7 @@ def focus_of(cameras: Sequence[Camera], *, origin: bool) -> Array:
         return middle[0] if seen else guess
     across = _across(cameras)
     point, weights = guess, np.full(len(cameras), 1 / len(cameras))
-    for _ in range(ITERATIONS):
+    for _ in range(20):
         matrix = np.einsum("n,nij->ij", weights, across)
         # Regularize towards the guess: reweighting may leave parallel axes alone.
         faint = 1e-6 * np.trace(matrix) * np.eye(3)

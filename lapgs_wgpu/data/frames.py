@@ -16,7 +16,6 @@ from lapgs_wgpu.data.images import ImageFile
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.masks import MaskKind
 from lapgs_wgpu.data.normalize import Normalization
-from lapgs_wgpu.data.poses import place_of
 from lapgs_wgpu.data.stamps import ImageName
 
 Split = Literal["train", "val", "test"]
@@ -39,11 +38,6 @@ class Frame:
     mask_kind: MaskKind = "white"
     moving: Path | None = None  # the same of what moves, white
     states_size: bool = True  # whether the files state size or center of the lens; else they are those of the image
-
-    @property
-    def place(self) -> NDArray[np.float64]:
-        """(3,) the place of the camera."""
-        return place_of(self.T_cam_world)
 
 
 @dataclass(frozen=True, eq=False)

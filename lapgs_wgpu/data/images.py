@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import imageio.v3 as iio
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import ExifTags, Image
 
 from lapgs_wgpu.data.evenly import some
 from lapgs_wgpu.errors import InputError
@@ -39,7 +39,6 @@ _OTHERS = re.compile(  # first bytes of other formats
     rb"|(?P<BMP>BM)|(?P<OpenEXR>\x76\x2f\x31\x01)|(?P<JPEG_XL>\xff\x0a|.{4}JXL )",
     re.DOTALL,
 )
-_ORIENTATION = 0x0112  # EXIF's tag
 SIDEWAYS = 5  # orientations from this one on exchange width and height
 
 THUMBNAIL = 320  # longer side, pixels: what is blurred or equal at this size is so for a training, too
@@ -73,23 +72,25 @@ class ImageFile(NamedTuple):
         """Decode the image and shrink it to (width, height): see `decode`. Raises InputError."""
         image = decode(self.path)
         if self.upright:
-            image = _turned(image, self.orientation)
+            image = oriented(image, self.orientation)
         if image.shape[1::-1] != self.size:
-            raise InputError(
-                f"{self.path} is {size_text(image.shape[1::-1])} pixels now and was {size_text(self.size)} when the "
-                "capture was opened; put the image back."
-            )
+            sizes = f"{size_text(image.shape[1::-1])} pixels now and was {size_text(self.size)} when it was opened"
+            raise InputError(f"{self.path} is {sizes}; put the image back.")
         return shrink(image, size)
 
     @property
     def turned(self) -> "ImageFile":
         """The same file, read as its orientation says."""
-        size = self.size[::-1] if self.orientation >= SIDEWAYS else self.size
-        return self._replace(size=size, upright=True)
+        return self._replace(size=oriented_size(self.size, self.orientation), upright=True)
 
 
-def _turned(image: Pixels, orientation: int) -> Pixels:
-    """An image (H, W, C) as EXIF's orientation, 1 to 8, shows it."""
+def oriented_size(size: Size, orientation: int) -> Size:
+    """(width, height) as EXIF's orientation, 1 to 8, shows it."""
+    return size[::-1] if orientation >= SIDEWAYS else size
+
+
+def oriented(image: NDArray[Any], orientation: int) -> NDArray[Any]:
+    """An image (H, W, ...) as EXIF's orientation, 1 to 8, shows it."""
     if orientation >= SIDEWAYS:
         image = image.swapaxes(0, 1)
     rows = -1 if orientation in (3, 4, 7, 8) else 1
@@ -102,19 +103,14 @@ def check_image(path: Path, *, whole: bool = True) -> ImageFile:
 
     whole: also read every byte (of a PNG, verify each checksum); no pixel is decoded.
     """
-    try:
-        with Image.open(path, formats=_FORMATS) as file:
-            size, mode = file.size, file.mode
-            exif = file.format != "PNG" or "exif" in file.info  # else Pillow would decode a PNG to look for more
-            orientation = file.getexif().get(_ORIENTATION, 1) if exif else 1
-            deep = file.format == "PNG" and "16" in str(file.tile[0][3])
-            alpha = _has_alpha(file)
-            if whole:
-                file.verify()
-    except Image.UnidentifiedImageError:
-        raise InputError(f"{path} {_content(path)}") from None
-    except _ERRORS as reason:
-        raise InputError(f"{path} is not a readable image ({reason}); copy or render it again.") from None
+    with _decoding(path), Image.open(path, formats=_FORMATS) as file:
+        size, mode = file.size, file.mode
+        exif = file.format != "PNG" or "exif" in file.info  # else Pillow would decode a PNG to look for more
+        orientation = file.getexif().get(ExifTags.Base.Orientation, 1) if exif else 1
+        deep = file.format == "PNG" and "16" in str(file.tile[0][3])
+        alpha = _has_alpha(file)
+        if whole:
+            file.verify()
     if mode not in _MODES:
         raise InputError(f"{path} has pixels of mode {mode}; save it as RGB or RGBA with 8 bits per channel.")
     return ImageFile(path, size, orientation if orientation in range(1, 9) else 1, deep, alpha)
@@ -215,8 +211,10 @@ def check_film(images: Sequence[Path]) -> list[str]:
 def _decoding(path: Path) -> Iterator[None]:
     try:
         yield
+    except Image.UnidentifiedImageError:
+        raise InputError(f"{path} {_content(path)}") from None
     except _ERRORS as error:
-        raise InputError(f"{path} cannot be decoded as an image ({error}); copy or render it again.") from None
+        raise InputError(f"{path} is not a readable image ({error}); copy or render it again.") from None
 
 
 def encode_png(image: Pixels, *, level: int = 6) -> bytes:

@@ -16,14 +16,19 @@ LARGEST_ENTRY = 1e9  # of a pose: matrix products of larger entries lose all dig
 LARGEST_SIDE = 1e5  # of an image, pixels
 LARGEST_INTRINSIC = 1e6  # pixels
 TINY = 1e-12  # smaller values count as 0
+FINITE = -sys.float_info.max, sys.float_info.max  # all numbers that are finite
 
 
 @dataclass(frozen=True)
 class Fields:
-    """The fields of a JSON object. where: file and entry, which begin each error."""
+    """The fields of a JSON object; others raise InputError. where: file and entry, which begin each error."""
 
     values: dict[str, Any]
     where: str
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.values, dict):
+            raise InputError(f"{self.where} must be a JSON object, got {shown(self.values)}.")
 
     def __contains__(self, name: str) -> bool:
         return name in self.values
@@ -50,8 +55,7 @@ class Fields:
                 needed = " rows of ".join(map(str, shape[i:]))
                 raise InputError(f"{self.where}: {name} must be {needed} numbers, got {shown(bad[0])}.")
             entries = [entry for row in entries for entry in row]
-        each, bounds = f"each entry of {name}", (-LARGEST_ENTRY, LARGEST_ENTRY)
-        return np.array([number(entry, each, self.where, *bounds) for entry in entries]).reshape(shape)
+        return np.array([number(entry, f"each entry of {name}", self.where) for entry in entries]).reshape(shape)
 
     def entries(self, name: str, count: int | None = None) -> list[Any]:
         """Return a list of at least one entry, or of `count`. Raises InputError."""
@@ -63,7 +67,7 @@ class Fields:
 
     def objects(self, name: str, what: str) -> "list[Fields]":
         """Return a list of objects. what: an entry, for errors. Raises InputError."""
-        return [as_fields(value, f"{self.where}, {what} {i}") for i, value in enumerate(self.entries(name))]
+        return [Fields(value, f"{self.where}, {what} {i}") for i, value in enumerate(self.entries(name))]
 
     def table(self, what: str, *names: str) -> "list[Fields]":
         """Return the rows of a table that is stored as columns, lists of equal length. what: a row, for errors."""
@@ -73,21 +77,12 @@ class Fields:
         return [Fields(dict(zip(names, row, strict=True)), f"{self.where}, {what} {i}") for i, row in enumerate(rows)]
 
 
-def as_fields(value: Any, where: str) -> Fields:
-    """Check that a JSON value is an object. Raises InputError."""
-    if not isinstance(value, dict):
-        raise InputError(f"{where} must be a JSON object, got {shown(value)}.")
-    return Fields(value, where)
-
-
 def read_json(path: Path) -> Fields:
     """Read a file that holds a JSON object. Raises InputError."""
-    return as_fields(safe_json_toml.read_json(path), str(path))
+    return Fields(safe_json_toml.read_json(path), str(path))
 
 
-def number(
-    value: Any, name: str, where: str | Path, least: float = -sys.float_info.max, most: float = sys.float_info.max
-) -> float:
+def number(value: Any, name: str, where: object, least: float = -LARGEST_ENTRY, most: float = LARGEST_ENTRY) -> float:
     """Convert a JSON number, or a text that states one, to a finite float within bounds. Raises InputError."""
     try:
         if isinstance(value, bool) or not isinstance(value, int | float | str):

@@ -97,8 +97,7 @@ class Lens:
         if not covered(high):
             values = ", ".join(f"{value:.3g}" for value in (*self.radial, *self.tangential))
             raise InputError(
-                f"{where}: its distortion ({values}) bends the image so much that enlarging it {MAX_ZOOM:g} times "
-                "leaves gaps; check the coefficients."
+                f"{where}: its distortion ({values}) leaves gaps even in an image {MAX_ZOOM:g} times as big; check it."
             )
         for _ in range(20):
             middle = (low + high) / 2
@@ -116,14 +115,13 @@ class Lens:
 
 
 class Undistortion(NamedTuple):
-    """Resamples images of `lens` (at their size) to those of a pinhole camera with intrinsics K (3, 3); those of a
-    pinhole stay as they are."""
+    """Resamples images of `lens`, at its size, to those of a pinhole camera with intrinsics K (3, 3)."""
 
     lens: Lens
     K: Array
 
     def apply(self, image: Pixels) -> Pixels:
-        """Resample an image (H, W, C) bilinearly to the pinhole's, of the same size.
+        """Resample an image (H, W, C) bilinearly to the pinhole's, of the same size; one of a pinhole stays as it is.
 
         Colors weigh by their alpha, so that those of transparent pixels do not bleed into edges.
         """

@@ -6,7 +6,7 @@ file in `readers` and a line in READERS.
 
 import dataclasses
 from collections.abc import Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
@@ -15,6 +15,7 @@ from lapgs_wgpu.data.lens import Lens, Undistortion
 from lapgs_wgpu.data.masks import MOSTLY, check_masks, find_masks, read_mask
 from lapgs_wgpu.data.normalize import Normalization
 from lapgs_wgpu.data.placement import mover_cube, place
+from lapgs_wgpu.data.poses import place_of
 from lapgs_wgpu.data.readers import apps, colmap, hypernerf, panoptic, poses_bounds, transforms
 from lapgs_wgpu.data.stamps import by_camera, natural_key
 from lapgs_wgpu.data.timestamps import as_one_camera, disorder, held_out, in_step, read_times
@@ -84,24 +85,24 @@ def load_dataset(
     capture = dataclasses.replace(capture, frames=frames, cloud=cloud)
     fit, cloud, depths = place(capture, cameras, moving, warnings)
     whole = fit if fit is None or capture.moved is None else capture.moved.then(fit)
-    placed = {camera: fit.camera(camera) if fit else camera for camera in {view.camera for view in views}}
     # Without a cloud, what stands just before one camera would explain its images alone, and block those beside it.
-    if depths is not None and cloud is None:
-        near = NEAR_SHARE * depths[0]
-        placed = {camera: dataclasses.replace(seen, near=near) for camera, seen in placed.items()}
-    order = _by_film(frames, warnings) if capture.own_footage else range(len(frames))
+    near = NEAR_SHARE * depths[0] if depths is not None and cloud is None else 0.0
 
-    def of_split(split: Split) -> tuple[View, ...]:
-        chosen = [i for i in order if frames[i].split == split]
-        names = [f"{split}_{frames[i].label or f'{number:05d}'}" for number, i in enumerate(chosen)]
-        found = zip(names, chosen, strict=True)
-        return tuple(dataclasses.replace(views[i], name=name, camera=placed[views[i].camera]) for name, i in found)
+    @cache
+    def placed(camera: Camera) -> Camera:
+        return dataclasses.replace(camera if fit is None else fit.camera(camera), near=near)
+
+    found: dict[Split | None, list[View]] = {"train": [], "test": [], "val": []}
+    for i in _by_film(frames, warnings) if capture.own_footage else range(len(frames)):
+        mine = found[frames[i].split]
+        name = f"{frames[i].split}_{frames[i].label or f'{len(mine):05d}'}"
+        mine.append(dataclasses.replace(views[i], name=name, camera=placed(views[i].camera)))
 
     return Dataset(
         folder.resolve().name,
-        of_split("train"),
-        of_split("test"),
-        val=of_split("val"),
+        tuple(found["train"]),
+        tuple(found["test"]),
+        val=tuple(found["val"]),
         cloud=cloud,
         depths=depths,
         normalization=whole,
@@ -109,7 +110,7 @@ def load_dataset(
         warnings=tuple(warnings),
         time_source=time_source,
         own_footage=capture.own_footage,
-        summary=_summary(reader.name, capture, len(placed), time_source, whole),
+        summary=_summary(reader.name, capture, len({view.camera for view in views}), time_source, whole),
     )
 
 
@@ -163,7 +164,7 @@ def _timed(folder: Path, capture: Capture, frames: Sequence[Frame], warnings: li
     if not times:
         times, source = read_times(names, folder)
     if capture.own_footage:
-        names = as_one_camera(names, times, [frame.place for frame in frames])
+        names = as_one_camera(names, times, [place_of(frame.T_cam_world) for frame in frames])
         warnings += disorder(names, times)
         times = in_step(names, times)
     first, last = capture.time_range or (min(times), max(times))
@@ -218,19 +219,16 @@ def _views(frames: Sequence[Frame], size: Size, *, shared: bool) -> list[View]:
         if key not in cameras:
             K, taken = (lens.K, lens.size) if lens.is_pinhole else (undistortion.K, stored)
             cameras[key] = Camera(K, frame.T_cam_world, *taken).resized(*size)
-        load = partial(_pixels, frame.image, undistortion, stored, size)
-        view = View("", cameras[key], frame.time, str(frame.image), load)
-        mask = partial(read_mask, undistortion=undistortion, stored=stored, size=size)
-        if frame.mask is not None and frame.split == "train":
-            view = dataclasses.replace(view, ignored=partial(mask, frame.mask, frame.mask_kind))
-        if frame.moving is not None:
-            view = dataclasses.replace(view, moving=partial(mask, frame.moving, "white", above=MOSTLY))
-        views.append(view)
+        load = partial(_pixels, frame.image, undistortion, size)
+        mask = partial(read_mask, undistortion=undistortion, size=size)
+        ignored = partial(mask, frame.mask, frame.mask_kind) if frame.mask and frame.split == "train" else None
+        moving = partial(mask, frame.moving, "white", above=MOSTLY) if frame.moving else None
+        views.append(View("", cameras[key], frame.time, str(frame.image), load, ignored, moving))
     return views
 
 
-def _pixels(image: ImageFile, undistortion: Undistortion, stored: Size, size: Size) -> Pixels:
-    return shrink(undistortion.apply(image.read(stored)), size)
+def _pixels(image: ImageFile, undistortion: Undistortion, size: Size) -> Pixels:
+    return shrink(undistortion.apply(image.read(undistortion.lens.size)), size)
 
 
 def _by_film(frames: Sequence[Frame], warnings: list[str]) -> list[int]:

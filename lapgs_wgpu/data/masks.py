@@ -51,10 +51,8 @@ def check_mask_size(path: Path, size: Size) -> None:
     """Check that a mask has the proportions of images of (width, height). Raises InputError."""
     stored = check_image(path, whole=False).size
     if not scales_to(stored, size):
-        raise InputError(
-            f"{path} is {size_text(stored)} pixels, and the images are {size_text(size)}, which has other "
-            "proportions; make the masks from the images."
-        )
+        sizes = f"{size_text(stored)} pixels, and the images are {size_text(size)}, of other proportions"
+        raise InputError(f"{path} is {sizes}; make the masks from the images.")
 
 
 def check_masks(masks: Sequence[Path], size: Size, kind: MaskKind, what: str) -> list[str]:
@@ -81,13 +79,13 @@ def check_masks(masks: Sequence[Path], size: Size, kind: MaskKind, what: str) ->
     return []
 
 
-def read_mask(path: Path, kind: MaskKind, undistortion: Undistortion, stored: Size, size: Size, above: int = 0) -> Mask:
-    """Decode the mask (H, W) of an image of (width, height) `stored` that is undistorted and shrunk to `size`.
+def read_mask(path: Path, kind: MaskKind, undistortion: Undistortion, size: Size, above: int = 0) -> Mask:
+    """Decode the mask (H, W) of an image that is undistorted and shrunk to (width, height).
 
-    The mask is first resized to `stored` by nearest neighbours. A pixel in which several mix is set if any of them is;
+    It is first resized to the lens's size by nearest neighbours. A pixel in which several mix is set if any of them is;
     `above` as in `MOSTLY`. Raises InputError.
     """
-    pixels = resize(as_pixels(decode_mask(path, kind)), stored, NEAREST)
+    pixels = resize(as_pixels(decode_mask(path, kind)), undistortion.lens.size, NEAREST)
     return shrink(undistortion.apply(pixels), size)[..., 0] > above
 
 

@@ -34,7 +34,7 @@ class Normalization(NamedTuple):
 
     def cloud(self, cloud: Cloud) -> Cloud:
         """Transform a cloud."""
-        return Cloud(self.points(cloud.points.astype(np.float64)), cloud.colors).rounded
+        return Cloud(self.points(cloud.points.astype(np.float64)).astype(np.float32), cloud.colors)
 
     def pose(self, T_cam_world: Array) -> Array:
         """Transform a pose (4, 4)."""

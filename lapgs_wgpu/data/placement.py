@@ -49,7 +49,7 @@ def place(
     if cloud is not None and capture.own_footage:
         cloud = _filled(cloud, cameras)
     if cube is None or (capture.keeps_coordinates and cube.fits):
-        return None, cloud and cloud.rounded, depths
+        return None, cloud and Cloud(cloud.points.astype(np.float32), cloud.colors), depths
     fit = Normalization(cube.center, BOX / cube.half)
     return fit, cloud and fit.cloud(cloud), depths and (depths[0] * fit.scale, depths[1] * fit.scale)
 
@@ -72,9 +72,8 @@ def _depths(capture: Capture, cameras: Sequence[Camera], warnings: list[str]) ->
     near, far = NEAR_FACTOR * float(depth[depth > 0].min()), FAR_FACTOR * float(depth.max())
     if are_parallel(cameras):
         warnings.append(
-            f"{capture.source}: there is no cloud, and all cameras look in one direction, so nothing tells how far "
-            f"away the scene is, and {near:.3g} to {far:.3g} in the capture's units is a guess: walk around what "
-            "moves, or give a cloud."
+            f"{capture.source}: there is no cloud, and all cameras look in one direction, so that the scene is "
+            f"{near:.3g} to {far:.3g} away, in its units, is a guess: walk around what moves, or give a cloud."
         )
     return near, far
 

@@ -18,13 +18,12 @@ from PIL import Image
 from scipy import ndimage, sparse
 from scipy.sparse.linalg import spsolve
 
-from lapgs_wgpu.data.cloud import points_at
+from lapgs_wgpu.data.cloud import Array, points_at
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.views import Dataset, small_views
 from lapgs_wgpu.progress import counted, say
 from lapgs_wgpu.splat.camera import Camera
 
-Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
 SIDE = 128  # pixels, of the images that are compared
@@ -129,10 +128,8 @@ def _stills(dataset: Dataset, at: float | None = None) -> list[_Still]:
 
 
 def _sweep(still: _Still, stills: list[_Still], planes: Array, least: float) -> Array:
-    """(H, W) the inverse depth at which the better half of the neighbors sees the same; NaN where none does.
-
-    least: distance of a neighbor, world units.
-    """
+    """(H, W) the inverse depth at which the better half of the neighbors sees the same; NaN where none does. least:
+    distance of a neighbor, world units."""
     apart = [float(np.linalg.norm(other.camera.position - still.camera.position)) for other in stills]
     order = [i for i in np.argsort(apart, kind="stable") if apart[i] > least][:NEIGHBORS]
     if len(order) < 2:
@@ -149,8 +146,7 @@ def _sweep(still: _Still, stills: list[_Still], planes: Array, least: float) -> 
 
 
 def _likeness(still: _Still, others: list[_Still], plane: float) -> Array:
-    """(H, W) mean normalized cross-correlation with the better half of the others at this inverse depth; -1 where
-    fewer than two see it."""
+    """(H, W) mean correlation with the better half of the others at this inverse depth; -1 where fewer than two see."""
     correlations = []
     for other in others:
         there = _carried(other, still.camera, plane)

@@ -26,9 +26,8 @@ _DAY = 86400.0  # seconds
 
 
 class ImageName(NamedTuple):
-    """file: relative path of an image, as in times.json. camera: the camera that took it, the name of its folder, or of
-    its file where the folders are times. part: of the path, which states the time; empty where all of the file's name
-    does."""
+    """file: relative path of an image, as in times.json. camera: the name of its folder, or of its file where folders
+    are times. part: of the path, which states the time; empty where all of the file's name does."""
 
     file: str
     camera: str = ""
@@ -132,8 +131,7 @@ def extent(places: Sequence[NDArray[np.float64]]) -> float:
 
 
 def stand_still(names: Iterable[ImageName], places: Mapping[str, NDArray[np.float64]]) -> bool:
-    """Whether there are several cameras, each at one place, as exactly as structure from motion finds it. places: (3,)
-    of the cameras of some of the files."""
+    """Whether there are several cameras, each at about one place. places: (3,) of those of some of the files."""
     placed = [name for name in names if name.file in places]
     cameras = [[places[placed[i].file] for i in mine] for mine in by_camera(placed).values()]
     if len(cameras) < 2:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data.evenly import some
-from lapgs_wgpu.data.json_fields import number, read_json
+from lapgs_wgpu.data.json_fields import FINITE, number, read_json
 from lapgs_wgpu.data.stamps import STILL, ImageName, by_camera, clock_times, extent, natural_key
 from lapgs_wgpu.errors import InputError
 
@@ -39,7 +39,7 @@ def read_times(names: Sequence[ImageName], folder: Path) -> tuple[list[float], s
             f"{path} has {len(stated)} times{example}, but none for {len(missing)} of {len(names)} images, such "
             f"as {missing[0]}; name each image by its path below images/."
         )
-    return [number(stated[file], f"the time of {file}", path) for file in listed], str(path)
+    return [number(stated[file], f"the time of {file}", path, *FINITE) for file in listed], str(path)
 
 
 def time_step(times: NDArray[np.float64]) -> float:
@@ -112,8 +112,7 @@ def frame_numbers(names: Sequence[ImageName]) -> list[int]:
             found[i] = frame
             if (before := first.setdefault(frame, file)) != file:
                 raise InputError(
-                    f"{file} has the frame number {frame}, as {before} has; rename one, or put the images of each "
-                    "camera into a folder of their own."
+                    f"{file} has the frame number {frame}, as {before} has; rename one, or give each camera a folder."
                 )
     return found
 

@@ -70,8 +70,7 @@ def check_plausible(frames: Sequence[Frame]) -> list[str]:
     if highest < DARK:
         bits = highest.bit_length()
         warnings.append(
-            f"images of 16 bits are nearly black: {told}, so they seem to use {8 + bits} bits; multiply them by "
-            f"{2 ** (8 - bits)}."
+            f"images of 16 bits are nearly black: {told}, as of {8 + bits} bits; multiply them by {2 ** (8 - bits)}."
         )
     highest, told = _highest([frame.image for frame in frames if frame.image.alpha], "alpha")
     if highest < DARK:
@@ -180,8 +179,7 @@ def check_times(dataset: Dataset, *, moving: bool) -> list[str]:
             tested = sum(low < view.time < high for view in dataset.test)
             warnings.append(
                 f"{source}: no training image has a time between {low:.4g} and {high:.4g}, though the usual step is "
-                f"{usual:.2g}; the motion there, in {tested} test images too, is unconstrained: add images, or cut the "
-                "clip there."
+                f"{usual:.2g}; the motion of {tested} test images there is unconstrained: add images, or cut the clip."
             )
     first: dict[tuple[bytes, bytes, float], View] = {}
     keys = [(view.camera.K.tobytes(), view.camera.T_cam_world.tobytes(), view.time) for view in dataset.train]
@@ -190,9 +188,8 @@ def check_times(dataset: Dataset, *, moving: bool) -> list[str]:
     if repeated:
         before, view = repeated[0]
         warnings.append(
-            f"{source}: {len(repeated)} of {count} training images repeat the time of another image of the same "
-            f"camera, such as {view.name} and {before.name} at {view.time:g}; the training averages them, so give each "
-            "image its own time, or remove it."
+            f"{source}: {len(repeated)} of {count} training images repeat the time of another image of their camera, "
+            f"such as {view.name} and {before.name} at {view.time:g}, and are averaged; correct times, or remove them."
         )
     return warnings
 
@@ -223,13 +220,11 @@ def check_in_view(dataset: Dataset, points: NDArray[np.floating]) -> list[str]:
 def check_spacing(dataset: Dataset) -> list[str]:
     """Warn about still cameras too far apart for views between them."""
     apart = degrees_apart(dataset.cameras, dataset.focus) if dataset.is_rig else 0.0
-    if apart <= FAR_APART:
-        return []
-    return [
+    told = (
         f"{dataset.name}: {len(dataset.cameras)} still cameras are {apart:.0f} degrees apart, seen from what they look "
-        f"at, over {FAR_APART:g}: none confirms another one's depths, so views between them show blobs; add cameras "
-        "between them."
-    ]
+        f"at, over {FAR_APART:g}: none confirms another one's depths, and views between show blobs; add cameras there."
+    )
+    return [told] if apart > FAR_APART else []
 
 
 def check_views(cloud: Cloud, named: Mapping[Camera, str], where: Path) -> list[str]:

@@ -8,19 +8,29 @@ from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lapgs_wgpu.data.images import LANCZOS, ImageFile, Pixels, Size, encode_png, resize, shrunk_size, size_text
+from lapgs_wgpu.data.images import (
+    LANCZOS,
+    ImageFile,
+    Pixels,
+    Size,
+    encode_png,
+    oriented,
+    oriented_size,
+    resize,
+    shrunk_size,
+    size_text,
+)
 from lapgs_wgpu.errors import InputError, optional_module
 from lapgs_wgpu.io.atomic import new_folder
 
 # Flags of swscale: bicubic, accurate rounding, chroma interpolated along rows. Its default darkens by 1 or 2 levels.
 EXACT_COLORS = 0x4 | 0x40000 | 0x2000
-COMPRESSION = 1  # of PNG: the next levels take twice as long for a tenth of the bytes
 LARGEST_FRAME = 8192 * 8192  # pixels; the decoder holds several frames
+TURNED = (1, 8, 3, 6), (2, 5, 4, 7)  # EXIF's orientations, by quarter turns counterclockwise; after mirroring
 _ATTACHED_PICTURE = 0x400  # libavformat's flag of a cover image
 WIDEST = 4.0  # width by height of a pixel, or height by width; what a header states beyond it is no such ratio
 WRITERS = min(8, os.cpu_count() or 1)  # threads that shrink and write the frames of the video that is being unpacked
@@ -44,12 +54,12 @@ def unpacked(path: Path, image_size: int | None) -> list[ImageFile]:
         raise InputError(f"{path} has no frame that can be decoded; copy or record it again.")
     if first.interlaced_frame:
         print(f"{path}: {INTERLACED}", file=sys.stderr, flush=True)
-    shape = display(first)
-    size = shape.size((first.width, first.height))
+    turned = orientation(first)
+    size = oriented_size((first.width, first.height), turned)
     wanted = shrunk_size(size, image_size)
     folder = frames_folder(path, wanted)
     if not folder.is_dir():
-        _unpack(path, folder, shape, size, wanted)
+        _unpack(path, folder, turned, size, wanted)
     return [ImageFile(file, wanted, source=f"{path}, frame {i}") for i, file in enumerate(sorted(folder.glob("*.png")))]
 
 
@@ -62,7 +72,7 @@ def frames_folder(path: Path, size: Size) -> Path:
     return caches / "frames" / "-".join(path.parts[1:-1][-2:]) / name
 
 
-def _unpack(path: Path, folder: Path, shape: "Display", size: Size, wanted: Size) -> None:
+def _unpack(path: Path, folder: Path, turned: int, size: Size, wanted: Size) -> None:
     """Write every frame, of (width, height) `size`, as PNG of the wanted size into a new folder. Raises InputError."""
     print(f"{path}: its frames are unpacked once, into {folder}", file=sys.stderr, flush=True)
     written, declared = list[Future[None]](), 0
@@ -74,12 +84,10 @@ def _unpack(path: Path, folder: Path, shape: "Display", size: Size, wanted: Size
         for packet in file.demux(stream):
             declared += packet.size > 0 and not packet.is_discard
             for frame in packet.decode():
-                image = shape.apply(frame.to_ndarray(format="rgb24", interpolation=EXACT_COLORS))
+                image = oriented(frame.to_ndarray(format="rgb24", interpolation=EXACT_COLORS), turned)
                 if image.shape[1::-1] != size:
-                    raise InputError(
-                        f"{path}: frame {len(written)} has {size_text(image.shape[1::-1])} pixels, and the first "
-                        f"has {size_text(size)}; convert it to one size."
-                    )
+                    sizes = f"{size_text(image.shape[1::-1])} pixels, and the first {size_text(size)}"
+                    raise InputError(f"{path}: frame {len(written)} has {sizes}; convert it to one size.")
                 if len(written) >= 2 * WRITERS:  # the decoder is ahead: bound the frames in memory
                     written[-2 * WRITERS].result()
                 written.append(pool.submit(_write, image, wanted, unfinished / f"{len(written):05d}.png"))
@@ -100,14 +108,12 @@ def opened_film(path: Path) -> Iterator[tuple[Any, Any]]:
             decoded = [each for each in films if each.codec_context is not None]
             if not decoded:
                 raise InputError(
-                    f"{path} has {len(films)} video streams, and PyAV can decode none; give the camera's recording, or "
-                    "convert it to H.264."
+                    f"{path} has {len(films)} video streams, and PyAV can decode none; record or convert it to H.264."
                 )
             stream = max(decoded, key=lambda each: (each.width or 0) * (each.height or 0))
             if not 1 <= stream.width * stream.height <= LARGEST_FRAME:
                 raise InputError(
-                    f"{path} states frames of {stream.width}x{stream.height} pixels; 1 to {LARGEST_FRAME:,} pixels a "
-                    "frame are allowed."
+                    f"{path} states frames of {stream.width}x{stream.height} pixels; 1 to {LARGEST_FRAME:,} are read."
                 )
             stream.thread_type = "AUTO"
             stream.codec_context.options = {"max_pixels": str(LARGEST_FRAME)}  # whatever the header states
@@ -116,34 +122,16 @@ def opened_film(path: Path) -> Iterator[tuple[Any, Any]]:
         raise InputError(f"{path} cannot be decoded as a film ({error}); copy or record it again.") from None
 
 
-class Display(NamedTuple):
-    """How the pixels of a film are shown: mirrored (left and right exchanged) first, then turned so many times by 90
-    degrees counterclockwise, 0 to 3."""
-
-    turns: int
-    mirrored: bool
-
-    def size(self, coded: Size) -> Size:
-        """(width, height) as shown."""
-        return coded[::-1] if self.turns % 2 else coded
-
-    def apply(self, image: NDArray[Any]) -> NDArray[Any]:
-        """The image (H, W, ...) as shown."""
-        if self.mirrored:
-            image = image[:, ::-1]
-        return np.ascontiguousarray(np.rot90(image, self.turns))
-
-
-def display(frame: Any) -> Display:
-    """The display of a frame: of its matrix, whose rotation alone PyAV states, wrongly for mirrored ones."""
+def orientation(frame: Any) -> int:
+    """EXIF's orientation of a frame: of its matrix, whose rotation alone PyAV states, wrongly for mirrored ones."""
     matrix = frame.side_data.get("DISPLAYMATRIX")
     if matrix is None:
-        return Display(round(frame.rotation / 90) % 4, False)
+        return TURNED[False][round(frame.rotation / 90) % 4]
     a, b, _, c, d = np.frombuffer(matrix, np.int32)[:5] / 65536  # x' = a x + c y, y' = b x + d y; y points down
     mirrored = bool(a * d - b * c < 0)
     if mirrored:  # the matrix times that of the mirror, which comes first
         a, b = -a, -b
-    return Display(round(float(np.arctan2(-b, a)) / (np.pi / 2)) % 4, mirrored)
+    return TURNED[mirrored][round(float(np.arctan2(-b, a)) / (np.pi / 2)) % 4]
 
 
 def pixel_aspect(stream: Any) -> float:
@@ -154,7 +142,7 @@ def pixel_aspect(stream: Any) -> float:
 
 def _write(image: Pixels, size: Size, path: Path) -> None:
     image = resize(image, size, LANCZOS)  # the filter of the figures published for Neu3D
-    path.write_bytes(encode_png(image, level=COMPRESSION))
+    path.write_bytes(encode_png(image, level=1))  # the next levels take twice as long for a tenth of the bytes
 
 
 def import_av(path: Path) -> Any:

@@ -128,8 +128,7 @@ class Dataset:
 
     @cached_property
     def moments(self) -> int:
-        """The number of moments of the clip: that of its times. Of a few still cameras, which may not be in step, it is
-        the largest number of images of one camera."""
+        """The number of times; of a few still cameras, which may not be in step, the most images of one of them."""
         most = max(Counter(view.camera for view in self.train).values())
         return most if len(self.cameras) <= most else len(self.times)
 

@@ -17,7 +17,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from lapgs_wgpu.data.images import ImageFile, Size, size_text
-from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, Fields, as_fields, read_json
+from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, Fields, read_json
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.poses import OPENGL_TO_OPENCV, Array, check_rotation, opengl_pose, world_to_camera
 from lapgs_wgpu.data.readers.colmap_model import is_model, read_model
@@ -103,7 +103,7 @@ def _toml(path: Path) -> Iterator[Named]:
         if isinstance(value, dict) and "matrix" in value:  # others are metadata
             if value.get("fisheye"):
                 raise InputError(f"{path}, {key} has a fisheye lens, which is not read; undistort its film first.")
-            entry, name = as_fields(value, f"{path}, {key}"), str(value.get("name", key))
+            entry, name = Fields(value, f"{path}, {key}"), str(value.get("name", key))
             yield _tabled(entry, name, "matrix", "distortions", "rotation", "translation", "size")
 
 

@@ -14,8 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from lapgs_wgpu.data.images import THUMBNAIL, Pixels, Size, blurred, repeats, sharpness, shrunk_size, size_text
-from lapgs_wgpu.data.video_frames import EXACT_COLORS, INTERLACED, display, import_av, opened_film, pixel_aspect
+from lapgs_wgpu.data.images import (
+    THUMBNAIL,
+    Pixels,
+    Size,
+    blurred,
+    oriented,
+    oriented_size,
+    repeats,
+    sharpness,
+    shrunk_size,
+    size_text,
+)
+from lapgs_wgpu.data.video_frames import EXACT_COLORS, INTERLACED, import_av, opened_film, orientation, pixel_aspect
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.progress import counted, say
 
@@ -84,16 +95,16 @@ class Film:
 
     def _shown(self, frame: Any) -> Size:
         """(width, height) of a frame as it is shown, in square pixels."""
-        return display(frame).size((max(1, round(frame.width * self._aspect)), frame.height))
+        return oriented_size((max(1, round(frame.width * self._aspect)), frame.height), orientation(frame))
 
     def _pixels(self, frame: Any, longer_side: int, *, gray: bool = False) -> Pixels:
         """(H, W, 3), or (H, W) gray."""
-        shape = display(frame)
-        width, height = shape.size(shrunk_size(self.size, longer_side))  # not yet turned
+        turn = orientation(frame)
+        width, height = oriented_size(shrunk_size(self.size, longer_side), turn)  # not yet turned
         transfer = None if gray else TRANSFERS.get(int(frame.color_trc))
         form, way = ("gray", _FAST_BILINEAR) if gray else ("rgb48le" if transfer else "rgb24", EXACT_COLORS)
         image = frame.to_ndarray(format=form, width=width, height=height, interpolation=way)
-        return shape.apply(to_sdr(image, transfer) if transfer else image)
+        return oriented(to_sdr(image, transfer) if transfer else image, turn)
 
     def frames(self) -> Iterator[Frame]:
         """Decode the frames in the order of their times. Raises InputError; a film that is damaged after its first

@@ -11,7 +11,7 @@ import numpy as np
 from lapgs_wgpu.data.capture_files import CaptureFiles
 from lapgs_wgpu.data.frames import Capture, Frame, Reader
 from lapgs_wgpu.data.images import SUFFIXES, check_image
-from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, number, read_json
+from lapgs_wgpu.data.json_fields import FINITE, LARGEST_INTRINSIC, read_json
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.poses import OPENGL_TO_OPENCV, opengl_pose, rotation_of, world_to_camera
 from lapgs_wgpu.data.stamps import ImageName, natural_key
@@ -47,7 +47,7 @@ def _read_record3d(folder: Path, image_size: int | None) -> Capture:
         x, y, z, w, *position = entry.matrix("poses", 7)
         R_world_cam = rotation_of(np.array([w, x, y, z]), where) @ OPENGL_TO_OPENCV
         pose, name = world_to_camera(R_world_cam, np.array(position)), ImageName(f"{images.name}/{file.name}")
-        time = number(entry.values[timed], timed, where) if timed in entry else index / data.number("fps", 1e-9, 1e5)
+        time = entry.number(timed, *FINITE) if timed in entry else index / data.number("fps", 1e-9, 1e5)
         frames.append(Frame(check_image(file), Lens(*size, *K.tolist()), pose, where, name, time))
     absent = count - len(files)
     warnings = [f"{images} holds {len(files)} images for {count} poses; the other poses are left out."]

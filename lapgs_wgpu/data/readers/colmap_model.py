@@ -1,7 +1,6 @@
 """Sparse models of COLMAP on disk, text or binary: cameras, images and points3D.
 
-The formats are those of COLMAP's documentation (colmap.github.io/format.html). Binary files are untrusted: a
-declared count reserves no memory.
+Source: colmap.github.io/format.html. Binary files are untrusted: a declared count reserves no memory.
 """
 
 import re
@@ -11,15 +10,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lapgs_wgpu.data.cloud import Cloud
+from lapgs_wgpu.data.cloud import Array, Cloud
 from lapgs_wgpu.data.json_fields import LARGEST_ENTRY, LARGEST_INTRINSIC, LARGEST_SIDE, TINY, number
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.poses import rotation_of
 from lapgs_wgpu.errors import InputError, shown
-
-Array = NDArray[np.float64]
 
 MODELS = (  # by their numbers in binary files
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
@@ -37,8 +33,7 @@ _NUMBERS = re.compile(r"([-+.\deE\s]|nan|inf)*")
 
 
 class ColmapImage(NamedTuple):
-    """A registered image. name: of its file, relative to the folder of images. T_cam_world: (4, 4) pose, OpenCV's
-    axes. where: file and entry, for errors."""
+    """name: of the file, below the folder of images. T_cam_world: (4, 4), OpenCV's axes. where: for errors."""
 
     name: str
     camera: int
@@ -109,8 +104,7 @@ def _camera(where: str, model: str, width: float, height: float, values: Sequenc
 
 def _image(name: str, camera: int, values: Sequence[float], where: str) -> ColmapImage:
     """values: a quaternion and a translation. Raises InputError."""
-    bounds = -LARGEST_ENTRY, LARGEST_ENTRY
-    pose = np.array([number(value, "each number of its pose", where, *bounds) for value in values])
+    pose = np.array([number(value, "each number of its pose", where) for value in values])
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = rotation_of(pose[:4], where), pose[4:]
     return ColmapImage(name, camera, T, where)

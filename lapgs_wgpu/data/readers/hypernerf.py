@@ -13,7 +13,7 @@ from lapgs_wgpu.data.capture_files import CaptureFiles
 from lapgs_wgpu.data.cloud import find_cloud, read_cloud
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import check_image
-from lapgs_wgpu.data.json_fields import LARGEST_SIDE, TINY, Fields, as_fields, number, read_json
+from lapgs_wgpu.data.json_fields import LARGEST_SIDE, TINY, Fields, number, read_json
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.normalize import Normalization
 from lapgs_wgpu.data.poses import check_rotation, world_to_camera
@@ -34,7 +34,7 @@ def _read(folder: Path, image_size: int | None) -> Capture:
     if depths[0] >= depths[1]:
         raise InputError(f"{scene.where}: near must be below far, got {depths[0]:g} and {depths[1]:g}.")
     metadata = read_json(folder / "metadata.json")
-    stated = {name: as_fields(metadata.required(name), f"{metadata.where}: {name}") for name in ids}
+    stated = {name: Fields(metadata.required(name), f"{metadata.where}: {name}") for name in ids}
     field = "time_id" if any("time_id" in entry for entry in stated.values()) else "warp_id"
     times = {name: int(entry.number(field, 0)) for name, entry in stated.items()}
     named = [name for names in splits.values() for name in names]

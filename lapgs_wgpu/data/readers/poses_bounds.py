@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lapgs_wgpu.data.cloud import Cloud, find_cloud, points_at, read_cloud, read_npy
+from lapgs_wgpu.data.cloud import Array, Cloud, find_cloud, points_at, read_cloud, read_npy
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import SUFFIXES, ImageFile, check_image, decode, decode_gray, size_text
-from lapgs_wgpu.data.json_fields import LARGEST_ENTRY, LARGEST_SIDE, number
+from lapgs_wgpu.data.json_fields import LARGEST_SIDE, number
 from lapgs_wgpu.data.lens import Lens
 from lapgs_wgpu.data.poses import check_rotation, world_to_camera
 from lapgs_wgpu.data.stamps import ImageName, natural_key
@@ -41,7 +40,6 @@ MOVING = (
     "{count} poses, whose axes are read as right, down and forward, as EndoNeRF's scenes have them; those of an LLFF "
     "capture are down, right and backward, so convert it to COLMAP's or nerfstudio's format"
 )
-Array = NDArray[np.float64]
 LLFF = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])  # from down, right and backward to right, down and forward
 
 
@@ -63,7 +61,7 @@ def _read_rows(path: Path, names: Sequence[str], what: str, axes: Array) -> list
     for i, (row, name) in enumerate(zip(rows, names, strict=True)):
         where = f"{path}, row {i} ({name})"
         for column, value in enumerate(row.tolist()):
-            number(value, f"column {column}", where, -LARGEST_ENTRY, LARGEST_ENTRY)
+            number(value, f"column {column}", where)
         pose, (near, far) = row[:15].reshape(3, 5), row[15:].tolist()
         height, width, f = pose[:, 4].tolist()
         if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE and f > 0):
@@ -95,8 +93,7 @@ def _read_neu3d(folder: Path, image_size: int | None) -> Capture:
     for other in others:
         if len(recordings[other]) != count:
             raise InputError(
-                f"{other} has {len(recordings[other])} frames and {first} has {count}; all cameras must have as many: "
-                "cut them to the same frames."
+                f"{other} has {len(recordings[other])} frames and {first} has {count}; cut all to the same frames."
             )
     frames = []
     for (recording, images), row in zip(recordings.items(), rows, strict=True):
@@ -135,8 +132,7 @@ def _recordings(folder: Path, image_size: int | None) -> dict[Path, list[ImageFi
 
 
 def _images(folder: Path, *, whole: bool = False) -> list[ImageFile]:
-    """Return the images of a folder, by number. whole: of `check_image`; those of a rig may be gigabytes. Raises
-    InputError if there is none."""
+    """The images of a folder, by number. whole: of `check_image`; a rig's may be gigabytes. Raises InputError."""
     files = sorted((f for f in listed(folder) if f.suffix.lower() in SUFFIXES), key=lambda f: natural_key(f.name))
     if not files:
         raise InputError(f"{folder} holds no images (.png or .jpg); extract the camera's frames into it.")

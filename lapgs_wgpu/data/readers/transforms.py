@@ -13,9 +13,9 @@ from lapgs_wgpu.data.capture_files import CaptureFiles
 from lapgs_wgpu.data.cloud import find_cloud, is_random, read_cloud
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import SIDEWAYS, ImageFile
-from lapgs_wgpu.data.json_fields import LARGEST_INTRINSIC, LARGEST_SIDE, Fields, number, read_json
+from lapgs_wgpu.data.json_fields import FINITE, LARGEST_INTRINSIC, LARGEST_SIDE, Fields, read_json
 from lapgs_wgpu.data.lens import Lens
-from lapgs_wgpu.data.poses import opengl_pose
+from lapgs_wgpu.data.poses import opengl_pose, place_of
 from lapgs_wgpu.data.stamps import ImageName, image_names
 from lapgs_wgpu.data.validation import check_frames
 from lapgs_wgpu.errors import InputError, shown
@@ -42,7 +42,7 @@ def _read_frames(data: Fields, files: CaptureFiles, time: str) -> dict[int, Fram
             raise InputError(
                 f"{entry.where} has no field {time}, though {timed} of {len(entries)} frames have it; give it for all."
             )
-        stated = number(entry.values[time], time, entry.where) if timed else None
+        stated = entry.number(time, *FINITE) if timed else None
         pose = opengl_pose(entry.required("transform_matrix"), entry.where)
         if found := files.image(entry, "file_path"):
             name, image = found
@@ -57,8 +57,7 @@ def _states(entry: Fields, field: str) -> bool:
 
 def read_lens(frame: Fields, shared: Fields, image: ImageFile) -> tuple[Lens, bool]:
     """Return the lens of a frame, and whether size or center are stated; each value is the frame's, else its file's. A
-    missing size is the image's; the focal length is that of camera_angle_x (radians) where fl_x is missing. Raises
-    InputError, also for other lens models."""
+    missing size is the image's, and a missing fl_x that of camera_angle_x (radians). Raises InputError."""
 
     def source(name: str) -> Fields:
         return frame if name in frame else shared
@@ -115,7 +114,7 @@ def _read_nerfstudio(folder: Path, image_size: int | None) -> Capture:
                 "train_filenames, val_filenames and test_filenames, and are left out."
             )
         frames = {f: dataclasses.replace(frame, split=splits[f]) for f, frame in frames.items() if f in splits}
-    names = image_names(list(frames), {file: frame.place for file, frame in frames.items()})
+    names = image_names(list(frames), {file: place_of(frame.T_cam_world) for file, frame in frames.items()})
     cloud = files.optional(data, "ply_file_path")
     return Capture(
         [dataclasses.replace(frames[name.file], name=name) for name in names],
