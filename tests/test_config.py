@@ -9,6 +9,7 @@ from lapgs_wgpu.cli import keys_help
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.train.config import Rate
+from lapgs_wgpu.train.optimizer import rate_at
 from lapgs_wgpu.train.presets import (
     ABLATIONS,
     config_keys,
@@ -122,8 +123,10 @@ def test_overrides() -> None:
 
 def test_each_learning_rate_can_be_0_and_goes_from_or_to_0_in_a_line() -> None:
     zero = {key: 0.0 for key in config_keys() if key.startswith("rates.") and not key.endswith(".steps")}
-    assert all(rate.at(1) == rate.at(10**6) == 0 for rate in load_config("dnerf", zero).rates.schedules().values())
-    assert Rate(0, 1e-3, 10).at(5) == Rate(1e-3, 0, 10).at(5) == 5e-4
+    assert all(
+        rate_at(rate, 1) == rate_at(rate, 10**6) == 0 for rate in load_config("dnerf", zero).rates.schedules().values()
+    )
+    assert rate_at(Rate(0, 1e-3, 10), 5) == rate_at(Rate(1e-3, 0, 10), 5) == 5e-4
 
 
 def test_base_gives_what_a_file_leaves_out(tmp_path: Path) -> None:

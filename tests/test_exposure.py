@@ -18,6 +18,7 @@ from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.train.config import Rate
 from lapgs_wgpu.train.exposure import Exposures, expose, expose_bwd
 from lapgs_wgpu.train.learners import restore_tensors
+from lapgs_wgpu.train.optimizer import rate_at
 from lapgs_wgpu.train.trainer import Trainer
 
 CORRECTION = torch.tensor([[0.9, 0.1, -0.05, 0.02], [0.03, 1.2, 0.0, -0.1], [-0.02, 0.05, 0.8, 0.2]])
@@ -69,7 +70,7 @@ def test_corrections_move_against_their_gradient_and_leave_the_scene_its_colors(
     exposures.step(1)
     moved = (exposures.values - IDENTITY).detach()
     torch.testing.assert_close(moved.mean(dim=0), torch.zeros(3, 4), rtol=0, atol=1e-7)
-    torch.testing.assert_close(moved[2] - moved[0], torch.full((3, 4), -RATE.at(1)))
+    torch.testing.assert_close(moved[2] - moved[0], torch.full((3, 4), -rate_at(RATE, 1)))
     assert torch.equal(moved[0], moved[3])
     assert exposures.values.grad is None
     assert exposures.state()["steps"].flatten().tolist() == [0, 0, 1, 0]

@@ -23,8 +23,8 @@ from lapgs_wgpu.errors import DeviceError, DeviceLostError, DeviceMemoryError, N
 from lapgs_wgpu.gpu import native
 from lapgs_wgpu.gpu.array import Buffer, DeviceArray
 from lapgs_wgpu.gpu.device import _DEFAULT_LIMITS, _RAISED_LIMITS, Device, DeviceInfo
+from lapgs_wgpu.gpu.driver_errors import translated_errors
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
-from lapgs_wgpu.gpu.native import translated_errors
 from lapgs_wgpu.run import resume, train
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.train.run_folder import load_state

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import DeviceMemoryError
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.gpu.native import Mapping, TextureCopies, translated_errors
+from lapgs_wgpu.gpu.driver_errors import translated_errors
+from lapgs_wgpu.gpu.native import Mapping, TextureCopies
 from lapgs_wgpu.gpu.shader import TABLE_TYPES, TABLE_WIDTH
 
 _ITEM_BYTES = {"float32": 4, "uint32": 4, "uint8": 1, "uint64": 8}

@@ -14,7 +14,7 @@ from lapgs_wgpu.errors import DeviceMemoryError
 from lapgs_wgpu.gpu import native
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.gpu.native import check_not_lost, translated_errors
+from lapgs_wgpu.gpu.driver_errors import check_not_lost, translated_errors
 from lapgs_wgpu.gpu.shader import Defines, ShaderError, compose, enabled, pack, reflect
 
 _APART = 256  # bytes: bindings of uniforms may begin at its multiples

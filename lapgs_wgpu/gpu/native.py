@@ -1,75 +1,26 @@
-"""wgpu's native library: the calls that a training step makes by the hundred, straight to it, and its errors.
+"""wgpu's native library: the calls that a training step makes by the hundred, straight to it.
 
 wgpu-py takes some 20 microseconds for each such call, and maps buffers by way of a thread that polls. Objects are
-wgpu-py's own, which keep them alive; errors are raised as wgpu-py raises them. It (0.32) raises both exhausted memory
-and a lost device at the call: the first as a validation error, the second as one or, when mapping a buffer, as an
-AttributeError. A submission that the library refuses ends the process instead. Hence commands are finished right before
-their submission, where a lost device raises an error in time, and sizes are checked before buffers are created.
+wgpu-py's own, which keep them alive; errors are raised as wgpu-py raises them.
 """
 
 import itertools
 import time
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-import wgpu
 from numpy.typing import NDArray
 from wgpu.backends.wgpu_native import ffi, lib
-from wgpu.backends.wgpu_native._api import error_handler
-from wgpu.backends.wgpu_native._helpers import ERROR_TYPES
 
-from lapgs_wgpu.errors import DeviceError, DeviceLostError, DeviceMemoryError
+from lapgs_wgpu.errors import DeviceLostError
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.gpu.driver_errors import raising
 
 # The longest wait for a graphics card, seconds: macOS kills work long before, and the library tells nobody.
 LONGEST_WAIT = 60.0
 _numbers = itertools.count(1)  # of mappings
 _statuses: dict[int, int] = {}  # of mappings that are done, by number
-
-
-@contextmanager
-def raising(what: str) -> Iterator[None]:
-    """Raise what the library reports of the calls within, as a wgpu.GPUError."""
-    error_handler.capture(what)
-    try:
-        yield
-    finally:
-        reported = error_handler.release(what)
-    if reported is not None:
-        kind, message = reported
-        raise ERROR_TYPES.get(kind, wgpu.GPUError)(message)
-
-
-@contextmanager
-def translated_errors(device: Device, what: str, nbytes: int = 0) -> Iterator[None]:
-    """Turn exhausted memory and a lost device into a DeviceError; other errors pass unchanged.
-
-    what: purpose of the memory. nbytes: its size, 0 if unknown.
-    """
-    try:
-        yield
-    except DeviceError:
-        raise
-    except (wgpu.GPUError, RuntimeError, AttributeError) as error:
-        if isinstance(error, wgpu.GPUOutOfMemoryError) or "Not enough memory left" in str(error):
-            size = f" of {nbytes / 1e6:.0f} MB" if nbytes else ""
-            raise DeviceMemoryError(
-                f"{device.info.name} has no memory left for {what}{size}, fewer Gaussians or smaller pictures need less"
-            ) from error
-        check_not_lost(device)
-        raise
-
-
-def check_not_lost(device: Device) -> None:
-    """Raise DeviceLostError if the device is lost."""
-    try:
-        device.wgpu_device.create_buffer(size=16, usage=wgpu.BufferUsage.COPY_DST)
-    except wgpu.GPUError as error:
-        if "device is lost" in str(error):
-            reason = "because its driver gave up or it was removed"
-            raise DeviceLostError(f"{device.info.name} was lost, {reason}") from error
 
 
 @ffi.callback("void(WGPUMapAsyncStatus, WGPUStringView, void *, void *)")

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.config import CamerasConfig
+from lapgs_wgpu.train.optimizer import rate_at
 
 MEAN_DECAY = 0.5  # of a camera's momentum: it is seen a few dozen times
 SQUARE_DECAY = 0.98  # of the second moment, which all cameras share
@@ -163,7 +164,7 @@ class CameraRefinement:
         config = self._config
         if not (self._settled or step >= config.start):
             return None
-        rate = config.rate.end if self._settled else config.rate.at(step)
+        rate = config.rate.end if self._settled else rate_at(config.rate, step)
         # A scene that is still blurred says nothing of what only parallax tells: the damping falls with the rate.
         return Pace(rate, (rate / config.rate.start) ** 2 if config.rate.start else 1.0, 1 - rate * config.pull)
 

@@ -25,7 +25,7 @@ class DataConfig(Options):
     background: Literal["black", "white"] = option("color behind the Gaussians and behind transparent images")
     cache_gb: float = option("memory limit for the images that are kept on the device, gigabytes")
     undistort: bool = option("resample images of lenses with distortion or skew to those of a pinhole camera", True)
-    vary_background: bool = option("train each image over a random color, against transparency", False)
+    vary_background: bool = option("another random background for each image: surfaces become opaque", False)
     units: Literal["world", "capture"] = option(
         "length unit of rates.means, smoothness.reach, field.bound and field.unit; capture: that of its files",
         "world",
@@ -79,13 +79,6 @@ class Rate(Options):
     start: float = option("initial value", at_least=0, below=math.inf)
     end: float = option("final value", at_least=0, below=math.inf)
     steps: int = option("step at which the final value is reached", at_least=1)
-
-    def at(self, step: int) -> float:
-        """The rate of a step, which are counted from 1."""
-        share = min(step / self.steps, 1.0)
-        if 0 in (self.start, self.end):  # which no exponential goes to
-            return self.start + share * (self.end - self.start)
-        return self.start ** (1 - share) * self.end**share
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.train.config import Rate
+from lapgs_wgpu.train.optimizer import rate_at
 
 MEAN_DECAY, SQUARE_DECAY = 0.9, 0.999  # Adam's
 EPS = 1e-15  # keeps 0 / 0 away
@@ -93,7 +94,7 @@ class Exposures:
         self._square[rows] = SQUARE_DECAY * self._square[rows] + (1 - SQUARE_DECAY) * gradient.square()
         mean = self._mean[rows] / (1 - MEAN_DECAY ** self._steps[rows])
         size = (self._square[rows] / (1 - SQUARE_DECAY ** self._steps[rows])).sqrt()
-        self.values[rows] -= self.rate.at(step) * mean / (size + EPS)
+        self.values[rows] -= rate_at(self.rate, step) * mean / (size + EPS)
         self.values.sub_(self.values.mean(dim=0) - torch.eye(3, 4))
         self.values.grad = None
 

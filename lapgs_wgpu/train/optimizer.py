@@ -13,6 +13,14 @@ ADAM_EPS = 1e-15  # 3DGS's: gradients of single Gaussians are tiny
 LARGEST_FREQUENCY_STEP = 0.02  # cycles over the clip
 
 
+def rate_at(rate: Rate, step: int) -> float:
+    """The learning rate of a step, which are counted from 1."""
+    share = min(step / rate.steps, 1.0)
+    if 0 in (rate.start, rate.end):  # which no exponential goes to
+        return rate.start + share * (rate.end - rate.start)
+    return rate.start ** (1 - share) * rate.end**share
+
+
 class Optimizer:
     """Adam over the Gaussians' parameters, one group each, and over the field's groups.
 
@@ -44,7 +52,7 @@ class Optimizer:
     def rates_at(self, step: int, share: float = 1.0) -> dict[str, float]:
         """The learning rate of each group in a step, counted from 1: a share of its schedule's."""
         names = [group["name"] for group in self._adam.param_groups]
-        return {name: share * min(self.rates[name].at(step), self.highest.get(name, math.inf)) for name in names}
+        return {name: share * min(rate_at(self.rates[name], step), self.highest.get(name, math.inf)) for name in names}
 
     def step(self, step: int, share: float = 1.0) -> None:
         """Move every parameter that has a gradient, at a share of the rates of this step (counted from 1)."""
@@ -135,7 +143,7 @@ class FrequencyOptimizer:
         self._square.copy_(0.999 * self._square + 0.001 * float(gradient.square().mean()))
         mean = self._mean / (1 - 0.9 ** int(self._steps))
         size = (float(self._square) / (1 - 0.999 ** int(self._steps))) ** 0.5
-        move = self.rate.at(step) * mean / (size + ADAM_EPS)
+        move = rate_at(self.rate, step) * mean / (size + ADAM_EPS)
         self.values.sub_(move.clamp(-LARGEST_FREQUENCY_STEP, LARGEST_FREQUENCY_STEP)).clamp_(0.0, self.limit)
         self.values.grad = None
 

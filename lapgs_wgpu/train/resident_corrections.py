@@ -10,6 +10,7 @@ from lapgs_wgpu.gpu.matmul import sum_columns
 from lapgs_wgpu.train.camera_refinement import MOST_POINTS, CameraRefinement
 from lapgs_wgpu.train.exposure import Exposures, expose, expose_bwd
 from lapgs_wgpu.train.learners import Learners
+from lapgs_wgpu.train.optimizer import rate_at
 from lapgs_wgpu.train.resident_parameters import Block, Place
 
 _CAMERA_FLOATS, _EXPOSURE_FLOATS = 16, 40  # rows of camera_step.wgsl and exposure_step.wgsl
@@ -130,7 +131,9 @@ class ResidentCorrections:
         kernel, count = Kernel.get(self._device, "exposure_step"), len(exposures.values)
         descent = self._pool.varying(
             "exposure step",
-            lambda: kernel.uniform("ExposureStep", number=self._image, count=count, rate=exposures.rate.at(self._step)),
+            lambda: kernel.uniform(
+                "ExposureStep", number=self._image, count=count, rate=rate_at(exposures.rate, self._step)
+            ),
         )
         arrays = {"guard": guard, "d_exposure": self._d_exposure, "exposures": self._exposure_rows}
         commands.dispatch(kernel, 1, descent=descent, **arrays)

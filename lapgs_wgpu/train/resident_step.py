@@ -24,6 +24,7 @@ from lapgs_wgpu.train.ground_truth import Draws
 from lapgs_wgpu.train.image_metrics import psnr_of
 from lapgs_wgpu.train.learners import Learners
 from lapgs_wgpu.train.motion_losses import compared_counts, even_times, near_time
+from lapgs_wgpu.train.optimizer import rate_at
 from lapgs_wgpu.train.resident_parameters import FREQUENCIES, PARTS
 from lapgs_wgpu.train.resident_passes import ResidentPasses, Task
 from lapgs_wgpu.train.step_result import Measured, Scheduled, Skipped, cause, check_parameters
@@ -107,7 +108,7 @@ class ResidentStep:
         before, view = self._draws.mark(), self._draws.next()
         rates = learners.optimizer.rates_at(scheduled.step, scheduled.share)
         if learners.frequencies is not None:
-            rates[FREQUENCIES] = learners.frequencies.rate.at(scheduled.step)
+            rates[FREQUENCIES] = rate_at(learners.frequencies.rate, scheduled.step)
         task = Task(scheduled, before, view, self._scene.timing(view.time), self._scene.sh_degree, rates)
         near = even = 0
         if config.field.kind != "static":
