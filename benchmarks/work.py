@@ -57,9 +57,10 @@ def count_scene(rasterizer: Rasterizer, drawing: Drawing) -> SceneCounts:
     visible = intersections = drawn = tiles = filled = 0
     for band in range(drawing.plan.bands):
         with Commands(rasterizer.device) as commands:
-            lists = rasterizer._draw_band(commands, drawing, band)
+            rasterizer._draw_band(commands, drawing, band)
         here = rasterizer._band_tiles(drawing, band)
-        seen, needed, ranges = read_all([lists.visible, drawing.needed[band], lists.ranges.rows(0, here)])
+        arrays = drawing.arrays
+        seen, needed, ranges = read_all([arrays["visible"], drawing.needed[band], arrays["ranges"].rows(0, here)])
         visible, intersections, tiles = visible + int(seen[0]), intersections + int(needed[0]), tiles + here
         listed = ranges[ranges[:, 1] > 0]
         drawn += int((listed[:, 2] - listed[:, 0]).sum())

@@ -143,8 +143,7 @@ class Rasterizer:
 
     def _draw_band(self, commands: Commands, drawing: Drawing, band: int) -> None:
         device, pool, config, gaussians = self.device, self.pool, self.config, drawing.gaussians
-        (first, last), (_, columns) = self._band_rows(drawing, band), self._tiles(drawing.camera)
-        n, capacity, tiles = len(gaussians), drawing.plan.capacity, (last - first) * columns
+        n, capacity, tiles = len(gaussians), drawing.plan.capacity, self._band_tiles(drawing, band)
         frame = pool.varying(f"frame {band}", lambda: self._frame(drawing, band))
         frame = drawing.move(commands, frame, band) if drawing.move else frame
         names = ("tile counts", "ids", "depth keys", "offsets")
@@ -199,6 +198,10 @@ class Rasterizer:
     def _band_rows(self, drawing: Drawing, band: int) -> tuple[int, int]:
         rows, _ = self._tiles(drawing.camera)
         return rows * band // drawing.plan.bands, rows * (band + 1) // drawing.plan.bands
+
+    def _band_tiles(self, drawing: Drawing, band: int) -> int:
+        first, last = self._band_rows(drawing, band)
+        return (last - first) * self._tiles(drawing.camera)[1]
 
     def _frame(self, drawing: Drawing, band: int) -> bytes:
         camera = drawing.camera
