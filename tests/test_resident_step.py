@@ -22,6 +22,7 @@ from torch import Tensor
 from lapgs_wgpu.data import Dataset, load_dataset
 from lapgs_wgpu.data.views import View
 from lapgs_wgpu.errors import DeviceLostError, DeviceMemoryError, InputError
+from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.motion.fields.deformation import Nearby, TimeSamples
@@ -316,12 +317,10 @@ def test_a_step_that_is_not_finite_is_skipped_and_named(device: Device, dataset:
 
 def spoil(passes: ResidentPasses, at: int) -> None:
     """Draw one of the steps on a background that is not finite."""
-    record, color = passes.record, passes._background
+    record = passes.record
 
-    def spoiled(commands: Commands, task: Task, *rest: Any, **how: Any) -> Recorded:
-        passes._background = (math.nan,) * 3 if task.scheduled.step == at else color
-        passes._recordings.clear()
-        return record(commands, task, *rest, **how)
+    def spoiled(commands: Commands, task: Task, truth: DeviceArray, background: Tensor) -> Recorded:
+        return record(commands, task, truth, background * math.nan if task.scheduled.step == at else background)
 
     passes.record = spoiled
 
