@@ -55,8 +55,10 @@ def playback_of(file: SceneFile, device: Device) -> Playback:
     Raises MemoryError if a buffer of all Gaussians exceeds the device's limits. The colors are the largest one: 1.4
     million Gaussians of degree 3 at WebGPU's default limits.
     """
-    if file.field_config.kind == "static" or file.field_config.decodes_on_device:
+    if file.field_config.kind == "static":
         return DevicePlayback(file, device)
+    if file.field_config.decodes_on_device:
+        return GridFieldPlayback(file, device)
     from lapgs_wgpu.motion.playback.torch_playback import TorchPlayback
     from lapgs_wgpu.motion.scene import scene_of
 
@@ -64,32 +66,25 @@ def playback_of(file: SceneFile, device: Device) -> Playback:
 
 
 class DevicePlayback:
-    """A Playback of static scenes, and of fields that `decodes_on_device`.
+    """A Playback of static scenes."""
 
-    Of these, what does not depend on the time is computed once. A time then costs the temporal encoding and one pass,
-    `deform`. Gaussians with static_features (N, F) need no static table.
-    """
+    moves = False
 
     def __init__(self, file: SceneFile, device: Device) -> None:
         self.device, self.metadata, self._file = device, file.metadata, file
-        self._config, self._parameters = file.field_config, file.field
+        self._config, self._pool = file.field_config, BufferPool(device)
         self.count = len(file.gaussians["means"])
-        self.moves = self._config.kind != "static"
         activated = activate(file.gaussians, file.sh_degree)
-        self._pool = BufferPool(device)
         names = ("means", "quats", "scales", "opacities", "sh")
         arrays = {name: self._pool.upload(name, activated[name]) for name in names}
         self._now = Gaussians(**arrays, antialiased=file.antialiased)
-        self._time: float | None = None  # of the Gaussians in the buffers, where a field moves them
-        if self.moves:
-            self._prepare(activated)
 
     def at(self, t: float) -> Gaussians[DeviceArray]:
-        t = self._file.timing(t)
-        if self.moves and self._time != t:
-            self._move(t)
-            self._time = t
         return self._now
+
+    def static_features(self) -> Floats | None:
+        """Return the features (count, F) of a compact scene, which replace the static table; None in static scenes."""
+        return None
 
     def snapshot(self, t: float) -> GaussianSnapshot:
         means, quats, scales, opacities, colors = read_all(list(self.at(t).arrays().values()))
@@ -99,17 +94,21 @@ class DevicePlayback:
         sh = np.concatenate([colors[:, :1], self._file.gaussians["sh_rest"]], axis=1)
         return GaussianSnapshot(means, sh, logits, np.log(scales), quats)
 
-    def static_features(self) -> Floats | None:
-        """Return the static grid's features H_s (count, F) at the canonical means, which replace its table in a compact
-        scene; None in static scenes."""
-        if not self.moves:
-            return None
-        columns = slice(_CANONICAL, _CANONICAL + self._static)
-        return np.concatenate([block["still"].read()[:, columns] for block in self._blocks.values()])
 
-    def _prepare(self, gaussians: dict[str, Floats]) -> None:
-        """Upload what a field needs, and encode what does not move. gaussians: as `activate` returns them."""
-        device, config = self.device, self._config
+class GridFieldPlayback(DevicePlayback):
+    """A Playback of fields that `decodes_on_device`.
+
+    What does not depend on the time is computed once. A time then costs the temporal encoding and one pass, `deform`.
+    Gaussians with static_features (N, F) need no static table.
+    """
+
+    moves = True
+
+    def __init__(self, file: SceneFile, device: Device) -> None:
+        super().__init__(file, device)
+        config, self._parameters = self._config, file.field
+        gaussians = activate(file.gaussians, file.sh_degree)
+        self._time: float | None = None  # of the Gaussians in the buffers
         self._defines = {"POINTS": 4, "QUADS": 2} if device.is_cpu else {"POINTS": 2, "QUADS": 1}
         self._defines["HEADS"] = 5 if config.appearance_size else 4
         self._motion_heads = 4 if config.kind == "laplacian" else 0
@@ -139,6 +138,17 @@ class DevicePlayback:
         heads = self._heads(0.0)
         self._stream_at = len(heads)
         self._weights = self._pool.upload("weights", np.concatenate([heads, self._stream()]))
+
+    def at(self, t: float) -> Gaussians[DeviceArray]:
+        t = self._file.timing(t)
+        if self._time != t:
+            self._move(t)
+            self._time = t
+        return self._now
+
+    def static_features(self) -> Floats:
+        columns = slice(_CANONICAL, _CANONICAL + self._static)
+        return np.concatenate([block["still"].read()[:, columns] for block in self._blocks.values()])
 
     def _block(self, gaussians: dict[str, Floats], first: int, size: int) -> dict[str, DeviceArray]:
         """Upload what a dispatch of at most `size` Gaussians reads: points (count, 4), still (count, 16 + still
