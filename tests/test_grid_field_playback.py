@@ -13,7 +13,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
 from lapgs_wgpu.motion.playback import playback
-from lapgs_wgpu.motion.playback.playback import DevicePlayback
+from lapgs_wgpu.motion.playback.playback import GridFieldPlayback
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.motion.scene_file import SceneFile
 from lapgs_wgpu.splat.rotation import rotate
@@ -44,12 +44,12 @@ def expected(scene: Scene4D, t: float) -> dict[str, Tensor]:
     }
 
 
-def device_field(scene: Scene4D) -> DevicePlayback:
+def device_field(scene: Scene4D) -> GridFieldPlayback:
     """The scene without torch, its buffers of what moves: colors as they are, rubbish elsewhere."""
     assert scene.field is not None
     parameters = {name: value.numpy(force=True) for name, value in scene.field.state_dict().items()}
     stored = {name: value.numpy(force=True) for name, value in scene.parameters.items()}
-    field = DevicePlayback(SceneFile("", scene.field_config, scene.sh_degree, stored, parameters, {}), scene.device)
+    field = GridFieldPlayback(SceneFile("", scene.field_config, scene.sh_degree, stored, parameters, {}), scene.device)
     for name in ("means", "quats", "scales", "opacities"):
         array = getattr(field._now, name)
         array.write(np.full(array.shape, np.nan, np.float32))

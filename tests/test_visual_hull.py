@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lapgs_wgpu.data import Dataset, View
-from lapgs_wgpu.discovery.surface_points import POINTS, hull_points
 from lapgs_wgpu.discovery.tracks import find_tracks
+from lapgs_wgpu.discovery.visual_hull import POINTS, hull_points
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.plan import camera_layout
 

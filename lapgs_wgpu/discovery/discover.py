@@ -22,9 +22,10 @@ from lapgs_wgpu.discovery.field_fit import fit_field
 from lapgs_wgpu.discovery.residual import Floats, Residual
 from lapgs_wgpu.discovery.rigid_fit import rigid_tracks
 from lapgs_wgpu.discovery.static_fit import static_fit
-from lapgs_wgpu.discovery.surface_points import PointClouds, hull_points, surface_points
+from lapgs_wgpu.discovery.surface_points import PointClouds, surface_points
 from lapgs_wgpu.discovery.tracks import Tracks, find_tracks
 from lapgs_wgpu.discovery.turns import find_turns
+from lapgs_wgpu.discovery.visual_hull import hull_points
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.own_field import check_own

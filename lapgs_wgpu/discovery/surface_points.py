@@ -4,9 +4,6 @@ Cameras of neighbouring times see a moving object from other sides while it has 
 space. Where cameras move slowly, they meet at a depth that the object's own motion feigns. Such votes are blurred along
 the ray, until the middle of the scene is as good a place as any. Places that differ at all times hold texture that the
 static fit blurs. They get no points.
-
-Between cameras all around, points of the visual hull (Laurentini, PAMI 1994): where nearly all cameras that see a place
-show what they usually do not.
 """
 
 from collections.abc import Iterable, Sequence
@@ -19,11 +16,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from lapgs_wgpu.data.evenly import evenly, evenly_indices
-from lapgs_wgpu.data.plane_sweep import IMAGES
-from lapgs_wgpu.data.views import AROUND, Dataset, View, composite, small_views
-from lapgs_wgpu.discovery.residual import Floats, Mask, Residual, cubic_grid
-from lapgs_wgpu.progress import counted
+from lapgs_wgpu.data.evenly import evenly_indices
+from lapgs_wgpu.discovery.residual import Floats, Residual, cubic_grid
 
 DEPTHS = 64  # that are tried along a ray
 COLOR_SPREAD = 0.25  # standard deviation of the colors of one surface in several images
@@ -36,13 +30,6 @@ MOTION = 0.05  # way from one time to the next that a depth must allow for
 MIDDLE = 2.0  # standard deviation of depths around that of the middle of the scene
 LONELY = 0.12  # a point is dropped whose fourth neighbour is further
 LINK = 0.11  # points closer than this are of one part
-TINT = 1.0  # `PointClouds.tint` between cameras all around: hands that hold a ball are not of one color with it
-# Of the visual hull:
-CELLS = 96  # along each axis of the cube
-DIFFERENT = 20.0  # levels of 255; mean of channels and neighboring pixels, from which on a pixel differs
-AGREEING = 0.9  # share of the cameras that see a place, in which it differs
-POINTS = 1500  # of a time, at most
-BLACK = 0.0, 0.0, 0.0
 
 
 class Points(NamedTuple):
@@ -181,54 +168,3 @@ def _always(images: Sequence[Residual], half_side: float) -> Floats:
         total += mask
         count += inside
     return np.divide(total, np.maximum(count, 1.0), dtype=np.float32).reshape(GRID, GRID, GRID)
-
-
-def hull_points(dataset: Dataset, half_side: float) -> PointClouds:
-    """Points of what moves within [-half_side, half_side]^3, for each time of a rig's clip. Raises InputError where an
-    image cannot be read."""
-    places = cubic_grid((np.arange(CELLS) + 0.5) / CELLS * 2 * half_side - half_side)
-    cameras = [
-        _still_camera([view for view in dataset.train if view.camera is camera], places) for camera in dataset.cameras
-    ]
-    clouds = []
-    for time in counted(dataset.times, len(dataset.times), "times searched for what moves"):
-        seeing, agreeing = np.zeros((2, len(places)), np.int32)
-        shown = []
-        for views, usual, pixel in cameras:
-            if (view := views.get(float(time))) is None:
-                continue
-            image = composite(view.load(), BLACK)
-            differs = ndimage.uniform_filter(np.abs(image - usual).mean(axis=2), 3) > DIFFERENT
-            if differs.mean() > 0.5:  # not what moves, but its exposure
-                continue
-            shown.append((image, differs, pixel))
-            seeing += pixel >= 0
-            agreeing += _at(ndimage.binary_dilation(differs), pixel)
-        there = np.flatnonzero((seeing >= AROUND) & (agreeing >= AGREEING * seeing))
-        there = there[evenly_indices(len(there), POINTS)]
-        colors = np.full((len(shown), len(there), 3), np.nan, np.float32)
-        for color, (image, differs, pixel) in zip(colors, shown, strict=True):
-            shows = _at(differs, pixel[there])
-            color[shows] = image.reshape(-1, 3)[pixel[there[shows]]] / 255
-        known = np.isfinite(colors).any(axis=(0, 2))
-        color = np.nanmedian(colors[:, known], axis=0)  # in some cameras something else is before it
-        clouds.append(Points(places[there[known]].astype(np.float32), color, np.ones(len(color), np.float32)))
-    return PointClouds(dataset.times, tuple(clouds), half_side, TINT * half_side)
-
-
-def _still_camera(
-    views: list[View], places: NDArray[np.float32]
-) -> tuple[dict[float, View], NDArray[np.float32], NDArray[np.int32]]:
-    """Small views, by time; their usual image (h, w, 3); and the pixel (n,) that shows each place, -1 where none."""
-    small = sorted(small_views(views, 160), key=lambda view: view.time)
-    usual = np.median([composite(view.load(), BLACK) for view in evenly(small, IMAGES)], axis=0).astype(np.float32)
-    camera = small[0].camera
-    pixels, depths = camera.project(places)
-    inside = (depths > 1e-9) & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
-    column, row = np.where(inside[:, None], pixels, 0).astype(np.int32).T
-    return {view.time: view for view in small}, usual, np.where(inside, row * camera.width + column, -1)
-
-
-def _at(mask: Mask, pixel: NDArray[np.int32]) -> Mask:
-    """(n,) the mask at pixels (n,), False where these are -1."""
-    return np.append(mask.ravel(), False)[pixel]
