@@ -21,9 +21,8 @@ from lapgs_wgpu.motion.playback.linear_pieces import Pieces, displacement, linea
 from lapgs_wgpu.motion.playback.playback import Playback
 from lapgs_wgpu.splat.linear_light import directions, display_colors, linear_harmonics, sh_basis, to_display, to_linear
 from lapgs_wgpu.viewer.export_4dgs import best_degree, export_4dgs
-from lapgs_wgpu.viewer.export_loss import measure
+from lapgs_wgpu.viewer.export_loss import measure, plain_factors
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene, load_scene
-from lapgs_wgpu.viewer.plain_opacity import plain_factors
 
 COUNT = 60
 TIMES = np.random.default_rng(1).random(12)  # of the clip

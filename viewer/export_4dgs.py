@@ -13,10 +13,9 @@ from lapgs_wgpu.motion.playback.linear_pieces import Pieces, linear_pieces
 from lapgs_wgpu.progress import Progress
 from lapgs_wgpu.splat.constants import CONSTANTS
 from lapgs_wgpu.splat.linear_light import directions, display_colors, linear_harmonics, sh_basis, to_display
-from lapgs_wgpu.viewer.export_loss import Loss, measure
+from lapgs_wgpu.viewer.export_loss import Loss, measure, plain_factors
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene, nearest_axis
 from lapgs_wgpu.viewer.moving_files import AXES, SH_RANGE, SampledPlayback, read_4dgs
-from lapgs_wgpu.viewer.plain_opacity import plain_factors
 
 _TIME_STEP = 1e-3  # seconds: the library rounds the middles of pieces to it (profile "fine")
 

@@ -12,10 +12,9 @@ from lapgs_wgpu.gpu.array import read_all
 from lapgs_wgpu.io.atomic import atomic_write
 from lapgs_wgpu.io.ply_elements import Floats
 from lapgs_wgpu.progress import counted
-from lapgs_wgpu.viewer.export_loss import Loss, measure
+from lapgs_wgpu.viewer.export_loss import Loss, measure, plain_factors
 from lapgs_wgpu.viewer.loaded_scene import LoadedScene, direction, nearest_axis
 from lapgs_wgpu.viewer.moving_files import USD_DEGREE, USD_HARMONICS, USD_KIND, SampledPlayback, load_pxr, read_usd
-from lapgs_wgpu.viewer.plain_opacity import plain_factors
 
 
 def export_usd(scene: LoadedScene, file: Path, frames: int | None = None) -> Loss:
