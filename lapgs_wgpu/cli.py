@@ -26,8 +26,8 @@ if typing.TYPE_CHECKING:
     from lapgs_wgpu.train.evaluate import Lpips
 
 Table = dict[str, typing.Any]
-STARTING = ("preset", "field", "ablate", "out", "resume", "overwrite", "view")  # options of a training that begins
-BESIDE = {  # those and the keys that can be given with --eval, and with --resume: where the capture is now
+STARTING = ("preset", "field", "ablate", "out", "resume", "overwrite", "view")  # options that start a training
+BESIDE = {  # of these and of the keys, what may be given with --eval (and data.movers), and with --resume
     "eval": ("data.path", "data.background", "data.cache_gb"),
     "resume": ("view", "data.path", "data.masks", "data.cache_gb"),
 }

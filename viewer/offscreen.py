@@ -94,9 +94,8 @@ def write_video(given: Any, device: Callable[[], Device]) -> None:
     av = optional_module("av", "writing mp4 needs PyAV", "video")
     rate = Fraction(fps).limit_denominator(65535)
     with atomic_write(given.video) as target, av.open(f"file:{target.name}", "w", format="mp4") as container:
-        stream = container.add_stream(
-            "libx264", rate, options={"crf": "18", "preset": "medium"}
-        )  # hardly distinguishable
+        options = {"crf": "18", "preset": "medium"}  # hardly distinguishable from no loss
+        stream = container.add_stream("libx264", rate, options=options)
         stream.width, stream.height = size
         stream.pix_fmt = "yuv420p"
         # Without these, players guess the color space from the image size: BT.601's matrix and limited range, as

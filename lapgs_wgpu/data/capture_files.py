@@ -120,7 +120,7 @@ def _leads_out(name: str) -> bool:
 
 
 def _of_any_size(name: str) -> str:
-    """A name that no file has, /x or a//x, for images/x and images_4/x or those in a."""
+    """The same name for images/x and images_4/x: /x, or a//x for those in a, which no file has."""
     return _SMALLER.sub(r"\1/", name)
 
 

@@ -72,8 +72,8 @@ def _depths(capture: Capture, cameras: Sequence[Camera], warnings: list[str]) ->
     near, far = NEAR_FACTOR * float(depth[depth > 0].min()), FAR_FACTOR * float(depth.max())
     if are_parallel(cameras):
         warnings.append(
-            f"{capture.source}: there is no cloud, and all cameras look in one direction, so that the scene is "
-            f"{near:.3g} to {far:.3g} away, in its units, is a guess: walk around what moves, or give a cloud."
+            f"{capture.source}: there is no cloud, and all cameras look in one direction: that the scene is "
+            f"{near:.3g} to {far:.3g} away, in its units, is a guess; walk around what moves, or give a cloud."
         )
     return near, far
 

@@ -47,7 +47,7 @@ SHEETS = 0.3  # in place of it where sheets fade one after another: small ones a
 RAMP_STEPS = 200  # over which learning rates rise after discovery, where schedule.warm_up is 0
 FOLLOWING = "motion discovery: following what moves from one time to the next"  # may take a minute
 SHOWN = 2.0 / 255  # of a channel: least difference from the background, and by which a part changes a pixel
-SCALE, OPACITY = 0.4, 0.3  # of a track's Gaussian; in mean distances to its nearest neighbours: more lie behind it
+SCALE, OPACITY = 0.4, 0.3  # of a track's Gaussian, in distances to its neighbours: low, since more lie behind it
 SHEET_SCALE, SHEET_OPACITY = 1.2, 0.9  # the same of parts that are sheets
 MOVING = 0.5  # share of the pixels in which a part shows that move, at least
 GAIN = 0.05  # or share of the static fit's error there that it takes away: where several images show each time
@@ -214,7 +214,7 @@ def tracks_in_images(
     """The parts that, each by itself, show where something moves; None where there are none.
 
     times: (T,), of the tracks. background: level of its channels. together: whether several images of the capture show
-    each time. Their depths then agree whatever moves, and a part that brings the static fit nearer to them is kept.
+    each time. Their depths then agree whatever moves, and a part is kept that brings the static fit nearer to images.
     """
     kept, level = np.zeros(tracks.parts, bool), torch.full((3,), background)
     for k in range(len(kept)):

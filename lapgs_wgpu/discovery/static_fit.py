@@ -30,7 +30,7 @@ SCHEDULE = {
     "density.reset_interval": 1.0,
 }
 REFINE = 0.125  # from when on cameras move, at the latest
-# The learning rates are those of 3DGS; of the losses, L1 and SSIM are left: a warm-up, which it all is, has no others.
+# The learning rates are those of 3DGS. It is all a warm-up, whose losses, without the pyramid, are L1 and SSIM.
 VALUES = {
     "field.kind": "static",
     "rates.log_scales": 5e-3,

@@ -25,10 +25,7 @@ FOLLOWED = 0.5  # of all points, how close tracks come that are good enough
 CLOSE = 0.03  # standard deviation of the distance from a track, by which two sets of tracks are compared
 CALM = 0.02  # jitter of a part's center that is no leaping
 LEAST_SEEN, LEAST_VISIT = 0.4, 0.2  # share of the times at which a part must be seen; that comes, stays and goes once
-LEAPS, LEAP_SIZE = (
-    1.7,
-    0.28,
-)  # jitter of a center that is leaping, in steps of its smoothed path and in sizes of its part
+LEAPS, LEAP_SIZE = 1.7, 0.28  # jitter of a leaping center, in steps of its smoothed path, and in sizes of its part
 EVEN = 0.35  # variation of the number of points that a part explains, relative to their mean, of one thing
 EXPLAINED = 0.3  # weight of points that an earlier key time's tracks explain
 SMOOTHING = 2.0  # times; standard deviation of the weights by which paths are smoothed

@@ -184,7 +184,7 @@ def _change(groups: _Groups, before: list[int], after: list[int]) -> float:
 
 def _smooth(groups: _Groups, path: list[int], *, alone: bool = False, bent: bool = False) -> Floats:
     """(T, 3) the path at every time: a straight line fitted to the groups around it, by weights that fall off in time.
-    alone: to those of other times. bent: a parabola where it leaps over times, in which what circles turns."""
+    alone: without those of the time itself. bent: a parabola across times without groups, where what circles turns."""
     centers = groups.centers[path]
     lapses = groups.clock[groups.time[path]] - groups.clock[:, None]
     counted = (lapses != 0) | (not alone)

@@ -189,7 +189,7 @@ def read_all(arrays: Sequence[DeviceArray]) -> list[NDArray[Any]]:
 class BufferPool:
     """Buffers by name, which grow and never shrink: a training step allocates nothing in steady state.
 
-    Only the object that owns the pool asks it for arrays; it passes them to others as arguments and results.
+    Its owner asks it for arrays, and the passes that it hands the pool to.
     """
 
     def __init__(self, device: Device) -> None:

@@ -1,6 +1,6 @@
 """Films as phones and cameras record them: upright frames of square pixels in 8-bit RGB, each with its own time.
 
-Of each span of a film the sharpest frame becomes an image of a capture, without repeated and blurred ones.
+Of each span of a film the sharpest frame, of cameras that stand still the first one, becomes an image of a capture.
 """
 
 import itertools
@@ -176,7 +176,7 @@ def images_per_second(films: Sequence[Film], asked: float | None) -> float:
 
 
 def extract(film: Film, images: Path, fps: float) -> list[Picture]:
-    """Write the images of a camera that moves, at most `fps` a second; of films, named by milliseconds. Raises
+    """Write the images of a camera that moves, at most `fps` a second, those of films named by milliseconds. Raises
     InputError for a film that is black or gives less than 2 images."""
     pictures, sharp, repeated, before = list[Picture](), list[float](), 0, None
     for _, frames in spans(film, fps):

@@ -65,8 +65,8 @@ def shapes_of(films: Sequence[Film]) -> list[Shape]:
 def extract_in_step(
     films: Sequence[Film], images: Path, fps: float, shapes: Sequence[Shape]
 ) -> list[dict[int, Picture]]:
-    """Write all images of cameras that stand still, below cam00, cam01, ..., as long as the shortest film: by the
-    number of their span of time, which is that of the other cameras' images of this time."""
+    """Write all images of cameras that stand still, below cam00, cam01, ..., as long as the shortest film. Returns for
+    each camera its images by the number of their span of time, the same in all cameras."""
     start_together(films)
     cameras = []
     for number, (film, shape) in enumerate(zip(films, shapes, strict=True)):

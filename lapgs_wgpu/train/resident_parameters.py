@@ -171,7 +171,7 @@ class ResidentParameters:
         return {block.name: block for part in PARTS for block in self._blocks_of[part]}
 
     def arrays(self, kind: str) -> FieldArrays:
-        """What the field computes with (kind "value"), or its gradients; the Gaussians' own for a scene without one."""
+        """What the field computes with (kind "value"), or its gradients; without one all but `sh` are `geometry`."""
         found = {name: block.arrays[kind] for name, block in self.blocks.items()}
         geometry, tables = found["geometry"], [array for name, array in found.items() if name.endswith(".table")]
         beside, weights = found.get("beside", geometry), found.get("weights", geometry)

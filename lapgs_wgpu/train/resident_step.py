@@ -89,8 +89,8 @@ class ResidentStep:
             self._settle_first()
 
     def take(self, scheduled: Scheduled, began: Callable[[], None]) -> Callable[[], Measured]:
-        """Submit a step, which at most IN_FLIGHT - 1 are in flight before; gives what it will have told, for which
-        that waits. began: called when it is submitted."""
+        """Submit a step, before which at most IN_FLIGHT - 1 are in flight. Returns a function that waits for what the
+        step tells. began: called when it is submitted."""
         task = self._task(scheduled)
         self._flying.append(self._submit(task))
         began()

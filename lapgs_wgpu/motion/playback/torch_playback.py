@@ -23,7 +23,7 @@ class TorchPlayback:
         self.scene = scene
         self.device, self.metadata = scene.device, scene.metadata
         self._pool = BufferPool(scene.device)  # a training uses its own
-        # What it is of: time, degree, ids and versions of parameters; these, so that no other tensor has their ids; it.
+        # A time, degree, and ids and versions of parameters; the parameters, which keep their ids; the Gaussians then.
         self._shown: tuple[tuple[Any, ...], list[Tensor], Gaussians[DeviceArray]] | None = None
 
     @property
