@@ -66,15 +66,15 @@ def playback_of(file: SceneFile, device: Device) -> Playback:
 
 
 class DevicePlayback:
-    """A Playback of static scenes."""
+    """A Playback of static scenes. activated: what `activate` returns of the file, where somebody has it."""
 
     moves = False
 
-    def __init__(self, file: SceneFile, device: Device) -> None:
+    def __init__(self, file: SceneFile, device: Device, activated: dict[str, Floats] | None = None) -> None:
         self.device, self.metadata, self._file = device, file.metadata, file
         self._config, self._pool = file.field_config, BufferPool(device)
         self.count = len(file.gaussians["means"])
-        activated = activate(file.gaussians, file.sh_degree)
+        activated = activated or activate(file.gaussians, file.sh_degree)
         names = ("means", "quats", "scales", "opacities", "sh")
         arrays = {name: self._pool.upload(name, activated[name]) for name in names}
         self._now = Gaussians(**arrays, antialiased=file.antialiased)
@@ -105,9 +105,9 @@ class GridFieldPlayback(DevicePlayback):
     moves = True
 
     def __init__(self, file: SceneFile, device: Device) -> None:
-        super().__init__(file, device)
-        config, self._parameters = self._config, file.field
         gaussians = activate(file.gaussians, file.sh_degree)
+        super().__init__(file, device, gaussians)
+        config, self._parameters = self._config, file.field
         self._time: float | None = None  # of the Gaussians in the buffers
         self._defines = {"POINTS": 4, "QUADS": 2} if device.is_cpu else {"POINTS": 2, "QUADS": 1}
         self._defines["HEADS"] = 5 if config.appearance_size else 4
