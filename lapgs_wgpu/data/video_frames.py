@@ -64,8 +64,8 @@ def unpacked(path: Path, image_size: int | None) -> list[ImageFile]:
 
 
 def frames_folder(path: Path, size: Size) -> Path:
-    """The folder for the frames of this (width, height), named by the film, its size and date, and the last two folders
-    that it lies in. Drives and shares are left out: the folder would not lie in the cache."""
+    """The folder of the cache for a film's frames of this (width, height). Its name tells the film, its size and date,
+    and the last two folders above the film; no drive or share, since joining one would lead out of the cache."""
     stat, path = path.stat(), path.resolve()
     caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lapgs_wgpu"
     name = f"{path.stem}-{size[0]}x{size[1]}-{stat.st_size:x}-{stat.st_mtime_ns:x}"
