@@ -47,7 +47,7 @@ def framed(camera: Camera, width: int, height: int) -> Camera:
     return Camera(K, camera.T_cam_world, width, height, camera.near)
 
 
-class Picture(OffscreenRenderer):
+class GivenRenderer(OffscreenRenderer):
     """What the options of lapgs-view ask for. view: the captured one that --view names; size and time are given, or of
     that view. Raises InputError where the file cannot be opened, or the capture lacks the view."""
 
@@ -64,7 +64,7 @@ class Picture(OffscreenRenderer):
 
 def write_screenshot(given: Any, device: Callable[[], Device]) -> None:
     """Write the PNG file that the options of lapgs-view ask for. Raises InputError where it cannot be written."""
-    picture = Picture(given, device)
+    picture = GivenRenderer(given, device)
     with atomic_write(given.screenshot) as target:
         target.write(encode_png(picture(picture.camera(picture.size), picture.time)))
     print(f"{given.screenshot}: {size_text(picture.size)}, time {picture.time:g}")
@@ -73,7 +73,7 @@ def write_screenshot(given: Any, device: Callable[[], Device]) -> None:
 def write_video(given: Any, device: Callable[[], Device]) -> None:
     """Write the MP4 file that the options of lapgs-view ask for. Atomic. Raises InputError where PyAV is missing or it
     cannot be written."""
-    picture = Picture(given, device)
+    picture = GivenRenderer(given, device)
     scene = picture.scene
     path = given.path or ("time" if scene.playback.moves else "view")
     if path != "view" and given.time is not None:
