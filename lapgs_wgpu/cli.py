@@ -181,8 +181,8 @@ def parse_options(arguments: list[str]) -> dict[str, typing.Any]:
         "training goes on when the window is closed")
     add("--device", metavar="NAME", help=DEVICE_HELP)
     add("--list-devices", action="store_true", help=LIST_DEVICES_HELP)
-    add("--eval", metavar="RUN", help="evaluate the finished run in folder RUN again; replaces metrics.json "
-        "and the images in eval/. Can be combined with --data, --data.background, --cache-gb, --device and "
+    add("--eval", metavar="RUN", help="evaluate the checkpoint in folder RUN again; replaces metrics.json "
+        "and the images in eval/. Takes --data, --data.background, --data.movers, --cache-gb, --device and "
         "--lpips-weights only")
     add("--lpips-weights", metavar="FILE", help="also compute LPIPS (VGG) in the evaluation with the weights in FILE, "
         "a .safetensors file (docs/metrics.md)")

@@ -35,7 +35,7 @@ class DataConfig(Options):
     )
     movers: str = option(
         "folder, absolute or in the capture, with a mask for each image, white where something moves: discovery looks "
-        "for it there alone, and the evaluation measures it apart; lapgs-prepare writes the folder masks",
+        "there alone, evaluation measures it apart, and with a point cloud it fills the cube (lapgs-prepare: masks)",
         "",
     )
     path: str = option(
@@ -63,7 +63,7 @@ class ScheduleConfig(Options):
         "number of training steps; the keys that count steps, rates.KEY.steps among them, stay", at_least=1
     )
     warm_up: int = option(
-        "steps in which only static Gaussians are trained; with discovery: over which learning rates rise from 0"
+        "steps in which only static Gaussians are trained; with discovery: over which learning rates rise (0: over 200)"
     )
     sh_interval: int = option("the degree of the spherical harmonics rises by one every N steps, up to 3", at_least=1)
     save_interval: int = option("save the state for --resume every N steps; 0: only if the training is interrupted")
@@ -113,7 +113,7 @@ class DensityConfig(Options):
         "image is 2 units wide)"
     )
     split: Literal["plain", "adaptive"] = option(
-        "which large Gaussians are split; plain: all; adaptive: those that differ most from their neighbors (the paper)"
+        "which large Gaussians are split; plain: all; adaptive: the 60 % least like their neighbors (the paper)"
     )
     min_opacity: float = option("prune Gaussians with a lower opacity", at_least=0, below=1)
     max_world_size: float = option(
@@ -158,7 +158,7 @@ class LossConfig(Options):
 
     ssim: float = option("weight w of SSIM; the image loss is (1 - w) L1 + w (1 - SSIM)", at_most=1)
     pyramid: float = option("weight of the Laplacian pyramid loss; 0: off")
-    ncc: float = option("weight of 1 - local normalized cross-correlation, from the end of the warm-up on; 0: off")
+    ncc: float = option("weight of 1 - local normalized cross-correlation, after the warm-up or discovery; 0: off")
     dynamics: float = option(
         "weight of the dynamics regularization, which pulls outlying dynamics attributes to the mean; 0: off"
     )
@@ -180,7 +180,7 @@ class SmoothnessConfig(Options):
     share: float = option("fraction of the Gaussians that are sampled in each step; 0: off", at_most=1)
     reach: float = option("largest offset between the two sampled positions along each axis, world units")
     time_reach: float = option("largest offset between the two sampled times, as a fraction of the clip")
-    start: int = option("compute it only after this step", 0)
+    start: int = option("compute it and the acceleration loss only after this step", 0)
 
 
 @dataclass(frozen=True)
@@ -188,8 +188,8 @@ class AccelerationConfig(Options):
     """The acceleration loss (train/motion_losses.py). Has defaults, since older config.toml files lack it."""
 
     weight: float = option(
-        "weight of the acceleration loss: distance of means and scales from the straight line between those shortly "
-        "before and after; 0: off",
+        "weight of the acceleration loss: distance of means and scales from the line between before and after; 0, "
+        "or nearly all moves: off",
         0.0,
     )
     share: float = option("fraction of the Gaussians that are sampled each time", 0.25, at_most=1)
@@ -209,7 +209,7 @@ class DiscoveryConfig(Options):
     size: int = option("longer side of the images for discovery, pixels", 100, at_least=16)
     field_steps: int = option("steps that fit the field to the motion that was found", 1500, at_least=1)
     least: float = option(
-        "start without what was found where it covers less than this fraction of what the static fit lacks",
+        "start without what was found where it covers less than this fraction of what moves",
         0.05,
         at_most=1,
     )
@@ -240,7 +240,7 @@ class CamerasConfig(Options):
         "how far a step moves a camera, as the angle by which its image then moves, radians", Rate(4e-3, 2e-4, 3_000)
     )
     pull: float = option("weight decay of the corrections, relative to the learning rate", 0.1, at_least=0)
-    start: int = option("first step that corrects cameras", 300, at_least=1)
+    start: int = option("first step that corrects cameras; 1 if discovery corrected them", 300, at_least=1)
 
 
 @dataclass(frozen=True)
@@ -284,7 +284,7 @@ class Config(Options):
     density: DensityConfig
     loss: LossConfig
     smoothness: SmoothnessConfig
-    seed: int = option("seed of all random numbers")
+    seed: int = option("seed of the random numbers, but for data.vary_background's colors")
     acceleration: AccelerationConfig = option("", AccelerationConfig())
     exposure: ExposureConfig = option("", ExposureConfig())
     cameras: CamerasConfig = option("", CamerasConfig())
