@@ -119,15 +119,15 @@ def _summary(layout: str, capture: Capture, cameras: int, time_source: str, move
     frames = capture.frames
     still = len(frames) >= 2 * cameras
     number = cameras if still else len({frame.name.camera for frame in frames})
-    told = f"{number} {'still' if still else 'moving'} camera{'s' * (number > 1)}"
+    cameras_text = f"{number} {'still' if still else 'moving'} camera{'s' * (number > 1)}"
     times = len({frame.time for frame in frames})
     held = [frame.name.camera for frame in frames if frame.split != "train"]
     trained = {frame.name.camera for frame in frames if frame.split == "train"}
-    one = len({*held}) == 1 and held[0] not in trained
-    out = f"{held[0]} is" if one else f"{len(held)} of {len(frames)} images are"
+    whole_camera = len({*held}) == 1 and held[0] not in trained
+    held_out = f"{held[0]} is" if whole_camera else f"{len(held)} of {len(frames)} images are"
     scale = "coordinates are kept" if moved is None else f"1 unit of the files becomes {moved.scale:.4g}"
     left_out = f"; {capture.left_out} left out" if capture.left_out else ""
-    return f"{layout}, {told}, {times} times from {time_source}; {out} held out; {scale}{left_out}"
+    return f"{layout}, {cameras_text}, {times} times from {time_source}; {held_out} held out; {scale}{left_out}"
 
 
 def _reader(folder: Path) -> Reader:

@@ -44,6 +44,7 @@ SHEET_DYNAMICS = 2.0  # in place of it: of all sheets, and of the last one's tim
 NEARLY_ALL = 0.8  # share of the surface points that tracks explain, above which the field has little left to learn
 ALL_TURN = 0.1  # of the field's highest rates, where all that moves turns: it forgets turns sooner than places
 SHEETS = 0.3  # in place of it where sheets fade one after another: small ones are lost at higher rates
+STEPS_PER_TIME = 30  # of the field's fit, of a rig, at least: what flies fast is lost by fewer
 RAMP_STEPS = 200  # over which learning rates rise after discovery, where schedule.warm_up is 0
 FOLLOWING = "motion discovery: following what moves from one time to the next"  # may take a minute
 SHOWN = 2.0 / 255  # of a channel: least difference from the background, and by which a part changes a pixel
@@ -113,7 +114,8 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
     scene = _scene_with(found, config, generator, own_field)
     field_fitted, summary = 0.0, f"{found.share:.1%} of what it lacks can be followed: nothing is added"
     if (tracks := found.tracks) is not None:
-        steps, parts, bodies = config.discovery.field_steps, len(np.unique(tracks.part)), len(found.light)
+        parts, bodies = len(np.unique(tracks.part)), len(found.light)
+        steps = max(config.discovery.field_steps, dataset.is_surrounded * STEPS_PER_TIME * len(found.times))
         meter = Progress(steps, "steps of motion discovery, part 2 of 2: what moves")
         error = fit_field(scene, tracks, found.times, steps, generator, meter.at, fades=found.sheets, light=found.light)
         meter.clear()
@@ -179,12 +181,11 @@ def _in_residuals(config: Config, dataset: Dataset, device: Device, generator: t
             f"{dataset.train[0].source} and the other {len(dataset.train) - 1} training images show nothing but the "
             f"{config.data.background} background; check the images and data.background."
         )
-    if dataset.is_rig:
-        depths = None  # a cut-out is of one camera
+    cutout_depths = None if dataset.is_rig else depths  # a cut-out is of one camera
     light: dict[int, Floats] = {}
-    if depths is not None:
+    if cutout_depths is not None:
         times = np.array([image.time for image in images])
-        tracks, share = cutout_tracks(images, depths, half_side)
+        tracks, share = cutout_tracks(images, cutout_depths, half_side)
     else:
         clouds = surface_points(images, half_side)
         times, tracks = clouds.times, find_tracks(clouds)
@@ -194,12 +195,12 @@ def _in_residuals(config: Config, dataset: Dataset, device: Device, generator: t
         share = explained_share(clouds, tracks)
     if share < config.discovery.least:
         tracks = None
-    elif tracks is not None and depths is None:
+    elif tracks is not None and cutout_depths is None:
         stands, turns = find_turns(tracks, times, images)
         if turns:
             tracks, light = rigid_tracks(tracks, stands, turns, times, images, device, generator)
     meter.clear()
-    return _Found(static, tracks, times, share, "a static fit", light, depths is not None, corrections)
+    return _Found(static, tracks, times, share, "a static fit", light, cutout_depths is not None, corrections)
 
 
 def tracks_in_images(

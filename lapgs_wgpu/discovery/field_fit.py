@@ -18,7 +18,7 @@ from lapgs_wgpu.train.optimizer import ADAM_EPS
 
 STILL = 300  # Gaussians of the static fit that a step asks to stay where they are
 MOVING = 1500  # Gaussians of tracks that a step asks, at most
-HASH_RATE, MLP_RATE = 1e-2, 2e-3  # learning rates: half of those of the preset tiny, twice train.start.MAX_*_RATE
+HASH_RATE, MLP_RATE = 1e-2, 2e-3  # learning rates: half of those of the preset tiny, twice train.setup.MAX_*_RATE
 LAST = 0.05  # of the learning rates, in the end; they fall over the second half
 SHAPE_WEIGHT = 0.1  # of changes of scales and quaternions, which the tracks do not know
 HIDDEN = 0.1  # weight of the places of what is faded, which would else wander before the cameras

@@ -167,6 +167,8 @@ class Scene4D:
 
         timing: takes the place of the scene's; with EVEN, t is the field's own time.
         """
+        if self.on_device is not None and not torch.is_grad_enabled():
+            return self.on_device((timing or self.timing)(t))
         return self.deformed(t, timing=timing).gaussians
 
     def deformed(
@@ -183,8 +185,6 @@ class Scene4D:
         of the field.
         """
         t = (timing or self.timing)(t)
-        if self.on_device is not None and not torch.is_grad_enabled() and nearby is None and time_samples is None:
-            return Deformed(self.on_device(t), None, [])
         p = self.parameters
         canonical = self.canonical()
         if self.field is None or len(self) == 0:

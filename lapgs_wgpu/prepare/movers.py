@@ -159,8 +159,8 @@ def judge(motion: Motion, model: Any) -> Judged:
     images, number = [model.image(i) for i in model.reg_image_ids()], motion.names.index
     poses = {number(image.name): np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for image in images}
     points = np.stack([point.xyz for point in model.points3D.values()])
-    every = max(1, len(motion.names) // 20)
-    depths = [points @ pose[2, :3] + pose[2, 3] for i, pose in poses.items() if i % every == 0]
+    stride = max(1, len(motion.names) // 20)
+    depths = [points @ pose[2, :3] + pose[2, 3] for i, pose in poses.items() if i % stride == 0]
     nearest = float(np.median([np.percentile(depth[depth > 0], 5) for depth in depths if (depth > 0).any()] or [1.0]))
     camera = images[0].camera
     scale = camera.width / motion.images[0].shape[1]
@@ -171,26 +171,26 @@ def judge(motion: Motion, model: Any) -> Judged:
         seen = np.asarray(camera.cam_from_img((flat + 0.5) * scale))
         return np.where(np.isfinite(at.reshape(-1, 2)), seen, np.nan)
 
-    def errors(i: int, noise: NDArray[np.floating]) -> tuple[Floats, dict[int, Floats]]:
+    def misses(i: int, noise_apart: NDArray[np.floating]) -> tuple[Floats, dict[int, Floats]]:
         """Of the grid (rows columns,), in times the noise; by offset, in pixels."""
         tracks = {k: at for k, at in motion.tracks[i].items() if i + k in poses}
         if i not in poses or len(tracks) < FEWEST:
             return np.full(motion.grid[..., 0].size, np.nan), {}
         relative = np.stack([poses[i + k] for k in tracks]) @ np.linalg.inv(poses[i])
         seen = np.stack([directions(at) for at in tracks.values()])
-        sigma = np.array([noise[abs(k)] for k in tracks]) / focal
+        sigma = np.array([noise_apart[abs(k)] for k in tracks]) / focal
         # Nothing is nearer than half as far as the nearest points of the scene.
         total, each = depth_errors(directions(motion.grid), seen, relative, sigma, 2 / nearest)
         return total, dict(zip(tracks, each * sigma[:, None] * focal, strict=True))
 
     noise = NOISE + NOISE_GROWS * np.arange(REACH + 1)
-    samples = [errors(i, noise)[1] for i in range(0, len(motion.names), max(1, len(motion.names) // 12))]
+    sampled = [misses(i, noise)[1] for i in range(0, len(motion.names), max(1, len(motion.names) // 12))]
     for apart in range(1, REACH + 1):
-        found = [error[np.isfinite(error)] for each in samples for k, error in each.items() if abs(k) == apart]
+        found = [error[np.isfinite(error)] for each in sampled for k, error in each.items() if abs(k) == apart]
         if sum(map(len, found)):
             quarter = np.percentile(np.concatenate(found), 25)
             noise[apart] = max(noise[apart], 1.55 * quarter)  # the median, if all were noise
-    planes = np.stack([errors(i, noise)[0] for i in range(len(motion.names))], dtype=np.float32)
+    planes = np.stack([misses(i, noise)[0] for i in range(len(motion.names))], dtype=np.float32)
     planes = planes.reshape(-1, *motion.grid.shape[:2])
     votes = _votes(motion, planes)
     limit = max(float(np.log(MOVES)), np.log(HALO) + _valley(votes[votes > np.log(1.5)]))
@@ -214,7 +214,7 @@ def depth_errors(ray: Floats, seen: Floats, relative: Floats, sigma: Floats, mos
     weight = known / sigma[:, None] ** 2
     inverse, total, error = np.zeros(len(ray), np.float32), np.full(len(ray), np.inf), np.zeros(known.shape)
     for step in range(5):
-        if step:
+        if step:  # the first looks at points at infinity
             z = np.maximum(far[..., 2] + inverse * move[..., 2], 1e-3)
             w = (weight / z**2 / (1.0 if step == 1 else 1 + np.square(error / 2)))[..., None]
             inverse = np.clip(-(w * a * b).sum(axis=(0, 2)) / np.maximum((w * a * a).sum(axis=(0, 2)), 1e-12), 0, most)

@@ -36,8 +36,8 @@ _OVERFLOW = 1 << 31  # close_guard.wgsl
 class ResidentStep:
     """Takes the steps of a training whose parameters stay on the device.
 
-    broken: called with the last step that was waited for where an error ends those behind it, and with None where the
-    parameters themselves are not finite. tell: called with what each step tells, in their order.
+    roll_back_to: called with the last finished step where an error ends those behind it, and with None where the
+    parameters themselves are not finite. on_measured: called with what each step has measured, in their order.
     """
 
     def __init__(
@@ -45,10 +45,11 @@ class ResidentStep:
         learners: Learners,
         density: DensityControl,
         draws: Draws,
-        broken: Callable[[int | None], None],
-        tell: Callable[[Measured], None],
+        roll_back_to: Callable[[int | None], None],
+        on_measured: Callable[[Measured], None],
     ) -> None:
-        self._learners, self._density, self._draws, self._broken, self._tell = learners, density, draws, broken, tell
+        self._learners, self._density, self._draws = learners, density, draws
+        self._roll_back_to, self._on_measured = roll_back_to, on_measured
         self._scene = scene = learners.scene
         self._passes = ResidentPasses(learners)
         self.parameters = self._passes.parameters
@@ -86,7 +87,7 @@ class ResidentStep:
     def settle(self, left: int = 0) -> None:
         """Wait until no more than `left` steps are in flight."""
         while len(self._flying) > left:
-            self._settle_first()
+            self._finish_first_or_roll_back()
 
     def take(self, scheduled: Scheduled, began: Callable[[], None]) -> Callable[[], Measured]:
         """Submit a step, before which at most IN_FLIGHT - 1 are in flight. Returns a function that waits for what the
@@ -97,7 +98,7 @@ class ResidentStep:
 
         def measured() -> Measured:
             while task.measured is None:
-                self._settle_first()
+                self._finish_first_or_roll_back()
             return task.measured
 
         return measured
@@ -138,14 +139,14 @@ class ResidentStep:
 
     # A step's end ----------------------------------------------------------------------------------------------------
 
-    def _settle_first(self) -> None:
+    def _finish_first_or_roll_back(self) -> None:
         """Wait for the step that was submitted first, and mend what it asks for.
 
-        After an error the parameters are those after the step which `broken` is called with.
+        After an error the parameters are those after the step which `roll_back_to` is called with.
         """
         tasks = list(self._flying)
         try:
-            self._settle()
+            self._finish_first()
         except Exception as error:
             self._flying.clear()
             undone = [task for task in tasks if task.measured is None]
@@ -153,18 +154,19 @@ class ResidentStep:
                 self._draws.go_back(task.before)
                 self._scene.sh_degree = task.sh_degree
             bad = isinstance(error, NumericalError) and len(undone) == len(tasks)  # else too many steps were skipped
-            self._broken(None if bad else tasks[-1].scheduled.step - len(undone))
+            self._roll_back_to(None if bad else tasks[-1].scheduled.step - len(undone))
             raise
 
-    def _settle(self) -> None:
+    def _finish_first(self) -> None:
         first = self._flying[0]
         guard, bad, values, totals, *needed = first.later.read()
         terms = self._passes.terms(first, values.tolist(), totals.tolist())
-        told = Measured(sum(terms.values()), psnr_of(float(values[1])), terms=terms)
-        if not guard[0]:
+        measured = Measured(sum(terms.values()), psnr_of(float(values[1])), terms=terms)
+        if not guard[0]:  # all fitted, and all is finite
             self._passes.rasterizer.grow_on_overflow(first.drawing, needed)
             self._flying.popleft()
-            self._end(first, told)
+            first.measured = measured
+            self._on_measured(measured)
             return
         behind = list(self._flying)  # which have changed nothing, as the first
         self._flying.clear()
@@ -172,18 +174,16 @@ class ResidentStep:
             each.later.read()
         self._passes.guard.write(np.zeros(1, np.uint32))
         self.parameters.steps = dict(first.counts)
-        if bad[0] & _OVERFLOW:
+        if bad[0] & _OVERFLOW:  # the buffers were too small
             self._passes.rasterizer.grow_on_overflow(first.drawing, needed)
-        else:
+        else:  # something was not finite
             self.to_host()
             check_parameters(self._learners.parameters())
             skipped = Skipped(first.scheduled.step, first.view.name, cause(terms, {}))
-            self._end(behind.pop(0), told._replace(skipped=skipped))
+            behind.pop(0)
+            first.measured = measured._replace(skipped=skipped)
+            self._on_measured(first.measured)
         self._flying.extend(self._submit(each) for each in behind)
-
-    def _end(self, task: Task, told: Measured) -> None:
-        task.measured = told
-        self._tell(told)
 
 
 def _draw_seed(generator: torch.Generator) -> int:

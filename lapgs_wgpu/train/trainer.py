@@ -107,7 +107,7 @@ class Trainer:
         self._exchange = ExchangeStep(*shared)
         self._resident = None
         if config.step_place == "resident":
-            self._resident = ResidentStep(*shared, self._broken, self._note)
+            self._resident = ResidentStep(*shared, self._roll_back_to, self._count_skipped)
         self._plans, camera = rasterizer_of(scene.device).plans, dataset.train[0].camera
         self._drawn = (camera.width, camera.height, True)  # the kind of images that the steps draw
         self._plans.set_bands(self._drawn, 1)
@@ -209,7 +209,7 @@ class Trainer:
         self.done = step
         self.whole = True
         if self._resident is None:
-            self._note(measured())
+            self._count_skipped(measured())
         return StepResult(step, self.config.schedule.steps, measured)
 
     def _share_of_rates(self, step: int) -> float:
@@ -218,8 +218,8 @@ class Trainer:
         falling, left = self.config.schedule.cool_down * steps, steps - step + 1
         return min(1.0, step / rising if rising else 1.0, left / falling if falling else 1.0)
 
-    def _note(self, measured: Measured) -> None:
-        """Take in whether a step was skipped. Raises NumericalError where too many in a row were."""
+    def _count_skipped(self, measured: Measured) -> None:
+        """Count the skipped steps in a row. Raises NumericalError where too many in a row were."""
         self._skipped = 0 if measured.skipped is None else self._skipped + 1
         if self._skipped == MOST_SKIPPED:
             what = f"{MOST_SKIPPED} steps in a row had values that are not finite; the last: {measured.skipped}"
@@ -228,7 +228,7 @@ class Trainer:
     def _began(self) -> None:
         self.whole = False
 
-    def _broken(self, settled: int | None) -> None:
+    def _roll_back_to(self, settled: int | None) -> None:
         """Go back to the end of a step: those behind it changed nothing, and an error ends them. None: no step is
         left to go back to."""
         self.whole = settled is not None
