@@ -207,7 +207,7 @@ class DiscoveryConfig(Options):
     )
     steps: int = option("training steps of the static fit that discovery begins with", 800, at_least=1)
     size: int = option("longer side of the images for discovery, pixels", 100, at_least=16)
-    field_steps: int = option("steps that fit the field to the motion that was found", 1500, at_least=1)
+    field_steps: int = option("steps that fit a field to what was found; on a rig at least 30 a time", 1500, at_least=1)
     least: float = option(
         "start without what was found where it covers less than this fraction of what moves",
         0.05,
