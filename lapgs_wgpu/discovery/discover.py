@@ -44,7 +44,7 @@ SHEET_DYNAMICS = 2.0  # in place of it: of all sheets, and of the last one's tim
 NEARLY_ALL = 0.8  # share of the surface points that tracks explain, above which the field has little left to learn
 ALL_TURN = 0.1  # of the field's highest rates, where all that moves turns: it forgets turns sooner than places
 SHEETS = 0.3  # in place of it where sheets fade one after another: small ones are lost at higher rates
-STEPS_PER_TIME = 30  # of the field's fit, of a rig, at least: what flies fast is lost by fewer
+FIT_STEPS_PER_TIME = 30  # of `fit_field` on a rig, at least: what flies fast is lost by fewer
 RAMP_STEPS = 200  # over which learning rates rise after discovery, where schedule.warm_up is 0
 FOLLOWING = "motion discovery: following what moves from one time to the next"  # may take a minute
 SHOWN = 2.0 / 255  # of a channel: least difference from the background, and by which a part changes a pixel
@@ -115,7 +115,7 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
     field_fitted, summary = 0.0, f"{found.share:.1%} of what it lacks can be followed: nothing is added"
     if (tracks := found.tracks) is not None:
         parts, bodies = len(np.unique(tracks.part)), len(found.light)
-        steps = max(config.discovery.field_steps, dataset.is_surrounded * STEPS_PER_TIME * len(found.times))
+        steps = max(config.discovery.field_steps, FIT_STEPS_PER_TIME * len(found.times) if dataset.is_surrounded else 0)
         meter = Progress(steps, "steps of motion discovery, part 2 of 2: what moves")
         error = fit_field(scene, tracks, found.times, steps, generator, meter.at, fades=found.sheets, light=found.light)
         meter.clear()
