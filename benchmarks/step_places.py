@@ -1,7 +1,7 @@
 """How trainings end with each place of the step: python benchmarks/step_places.py OUT CAPTURE... [KEY=VALUE...].
 
 Preset tiny without discovery, in the shape that graphics cards get, whatever the adapter is: PSNR of the test views of
-three seeds, dB. A run that OUT already has is not made again.
+five seeds, dB. A run that OUT already has is not made again.
 """
 
 import sys
@@ -15,7 +15,7 @@ from lapgs_wgpu.run import train
 from lapgs_wgpu.train.presets import load_config
 
 KEYS = {"discovery.enabled": "false", "data.size": "100", "schedule.steps": "300", "schedule.warm_up": "60"}
-SEEDS = range(3)
+SEEDS = range(5)
 
 
 def main(out: Path, captures: list[Path], keys: dict[str, str]) -> None:
