@@ -90,7 +90,8 @@ def run(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
     if "raster" in options.parts:
         results["raster"] = {}
         for scene in options.scenes:
-            raster = bench_raster(device, *scene.make(), meter, repeat)
+            arrays, camera = scene.make()
+            raster = bench_raster(device, arrays, camera, meter, repeat)
             print_raster(str(scene), raster)
             results["raster"][str(scene)] = raster
     if "encoder" in options.parts:

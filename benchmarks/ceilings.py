@@ -64,8 +64,9 @@ class CeilingKernels:
         }
         self._amounts = {COPY: 2 * COPIED}
         for name, kernel in computing.items():
-            groups = self._long_enough(lambda n, kernel=kernel: _compute(kernel, n, factors, self._target), shortest)
-            self._dispatches[name] = _compute(kernel, groups, factors, self._target)
+            compute = functools.partial(_compute, kernel, factors, self._target)
+            groups = self._long_enough(compute, shortest)
+            self._dispatches[name] = compute(groups)
             self._amounts[name] = groups * 64 * CHAINS * STEPS * TURNS
 
     def _long_enough(self, dispatch: Callable[[int], Callable[[Commands], None]], shortest: float) -> int:
@@ -86,11 +87,11 @@ class CeilingKernels:
 
     def ceilings(self, milliseconds: dict[str, Timing]) -> Ceilings:
         """From the times of `run`."""
-        rates = (1e3 * self._amounts[name] / milliseconds[name].median for name in KERNELS)
-        return Ceilings(*rates, together=self._device.is_cpu)
+        copied, operations, exponentials = (1e3 * self._amounts[k] / milliseconds[k].median for k in KERNELS)
+        return Ceilings(copied, operations, exponentials, self._device.is_cpu)
 
 
-def _compute(kernel: Kernel, groups: int, factors: DeviceArray, sums: DeviceArray) -> Callable[[Commands], None]:
+def _compute(kernel: Kernel, factors: DeviceArray, sums: DeviceArray, groups: int) -> Callable[[Commands], None]:
     return lambda commands: commands.dispatch(kernel, groups, factors=factors, sums=sums)
 
 

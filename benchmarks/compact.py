@@ -20,7 +20,7 @@ from lapgs_wgpu.viewer.offscreen import OffscreenRenderer
 def mean_psnr(path: Path, run: Path) -> float:
     """PSNR of the scene in a file on the test views of a run's capture, dB."""
     scene = load_scene(path, open_device)
-    views = [view for view in load_scene(run / "checkpoint.ply", open_device).views() if "test" in view.name]
+    views = [view for view in load_scene(run / "checkpoint.ply", open_device).views if "test" in view.name]
     if not views:
         raise SystemExit(f"{run}: its capture is not here")
     draw = OffscreenRenderer(scene)

@@ -92,7 +92,8 @@ def measure_run(run: Path, static_run: Path | None) -> tuple[float, float]:
 
     scene = load(run / "checkpoint.ply", device)
     static = None if static_run is None else load(static_run / "checkpoint.ply", device)
-    moving, still = [], []
+    moving: list[float] = []
+    still: list[float] = []
     for view, background in zip(views, still_backgrounds(views, truth), strict=True):
         if static is not None:
             pixels = differs_from_static(truth(view), drawn(static, view))
@@ -107,5 +108,5 @@ def measure_run(run: Path, static_run: Path | None) -> tuple[float, float]:
 
 
 if __name__ == "__main__":
-    of_moving, of_still = measure_run(*map(Path, sys.argv[1:2]), Path(sys.argv[2]) if len(sys.argv) > 2 else None)
+    of_moving, of_still = measure_run(Path(sys.argv[1]), Path(sys.argv[2]) if len(sys.argv) > 2 else None)
     print(f"{of_moving:.2f} dB of moving pixels, {of_still:.2f} dB of the others")

@@ -61,8 +61,8 @@ class Meter:
                 self._kernels.run()
                 function()
             run: dict[str, list[float]] = defaultdict(list)
-            for shader, milliseconds in times:
-                run[shader].append(milliseconds)
+            for shader, time in times:
+                run[shader].append(time)
             runs.append(run)
         runs = runs[2:]
         summaries = {shader: summary([sum(run[shader]) for run in runs]) for shader in runs[0]}

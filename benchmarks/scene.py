@@ -7,6 +7,7 @@ import re
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -130,4 +131,6 @@ def make_scene(size: SceneSize) -> tuple[dict[str, NDArray[np.float32]], Camera]
 def save_scene(path: Path, arrays: dict[str, NDArray[np.float32]], camera: Camera) -> None:
     """Write it as .npz, with K (3, 3), T_cam_world (4, 4), width and height, for other rasterizers to read."""
     K, T_cam_world = camera.K.astype(np.float32), camera.T_cam_world.astype(np.float32)
-    np.savez(path, K=K, T_cam_world=T_cam_world, width=camera.width, height=camera.height, **arrays)
+    sizes = {"width": np.int64(camera.width), "height": np.int64(camera.height)}
+    given: dict[str, Any] = {"K": K, "T_cam_world": T_cam_world, **sizes, **arrays}
+    np.savez(path, **given)

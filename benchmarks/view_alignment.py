@@ -16,6 +16,7 @@ from lapgs_wgpu.train.camera_refinement import CameraDescent, changed_camera, im
 from lapgs_wgpu.train.config import LossWeights, Rate
 from lapgs_wgpu.train.exchange_step import render_loss
 from lapgs_wgpu.train.ground_truth import marked_pixels, upload_rgba
+from lapgs_wgpu.train.optimizer import rate_at
 
 STEPS = 24
 RATE = Rate(4e-3, 2e-4, STEPS)  # radians of image motion: 1.5 degrees together
@@ -43,6 +44,6 @@ def aligned_view(scene: Scene4D, view: View, background: Tensor, unit: float) ->
             break
         damping = DAMPING[0] ** (1 - step / STEPS) * DAMPING[1] ** (step / STEPS)
         whiten = whitening(image_motion(camera, points, unit), damping)
-        move = descent.change(0, change.grad.double().numpy(), whiten, RATE.at(step))
+        move = descent.change(0, change.grad.double().numpy(), whiten, rate_at(RATE, step))
         camera = changed_camera(camera, move * np.repeat([1.0, unit], 3))
     return dataclasses.replace(view, camera=camera)

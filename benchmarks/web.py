@@ -46,7 +46,7 @@ def row(page: Path, browser: Browser) -> str:
     """Page, smallest PSNR, and ms a frame on the page, on the desktop in the page's shape, and in its own."""
     viewers = [Viewer(page, device) for device in (open_device(), gpu_shaped())]
     browser.open(page.as_uri())
-    wait_for(lambda: shown(browser), 300, "the scene")
+    wait_for(lambda: shown(browser), "the scene", 300)
     worst = np.inf
     camera = viewers[0].scene.camera()
     for change in (lambda camera: None, elsewhere):

@@ -5,6 +5,7 @@ python examples/own_loss.py
 
 import argparse
 
+import torch
 from torch import Tensor
 
 from lapgs_wgpu import Gaussians, Parts, Regularizer, Scene4D, TorchLoss, load_config, start_training
@@ -16,7 +17,7 @@ parser.add_argument("--steps", type=int, default=300)
 
 def edges(image: Tensor, truth: Tensor) -> Tensor:
     """L1 of the differences between neighbouring pixels."""
-    return sum((image.diff(dim=axis) - truth.diff(dim=axis)).abs().mean() for axis in (0, 1))
+    return torch.stack([(image.diff(dim=axis) - truth.diff(dim=axis)).abs().mean() for axis in (0, 1)]).sum()
 
 
 def needles(scene: Scene4D, gaussians: Gaussians, t: float) -> Tensor:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import operator
 import re
 import sys
 import textwrap
@@ -187,7 +188,7 @@ def parse_options(arguments: list[str]) -> dict[str, typing.Any]:
     add("--lpips-weights", metavar="FILE", help="also compute LPIPS (VGG) in the evaluation with the weights in FILE, "
         "a .safetensors file (docs/metrics.md)")
     # fmt: on
-    for name, kind in config_keys().items():
+    for name, (kind, _) in config_keys().items():
         entries = len(typing.get_args(kind)) if typing.get_origin(kind) is tuple else None
         words = [*SHORTCUTS.get(name, []), f"--{name}"]
         add(*words, dest=name, nargs=entries, default=argparse.SUPPRESS, help=argparse.SUPPRESS)
@@ -203,24 +204,20 @@ def parse_options(arguments: list[str]) -> dict[str, typing.Any]:
 def keys_help(preset: str) -> str:
     """The list of the keys of the configuration, those of no section first, with the values of a preset."""
     config, lines, section = load_config(preset), [KEYS.format(preset=preset)], None
-    for name, kind in sorted(config_keys().items(), key=lambda key: "." in key[0]):
+    for name, (kind, text) in sorted(config_keys().items(), key=lambda key: "." in key[0]):
         *sections, _ = name.split(".")
         if sections[:1] != section:
             section = sections[:1]
             lines.append("")
-        value: typing.Any = config
-        texts = []
-        for part in name.split("."):
-            texts.append(value.__dataclass_fields__[part].metadata.get("help"))
-            value = getattr(value, part)
+        value = operator.attrgetter(name)(config)
         entries = value if isinstance(value, tuple) else (value,)
         shown = " ".join(entry if isinstance(entry, str) else json.dumps(entry) for entry in entries)
         kinds = typing.get_args(kind) or (kind,)
         literal = typing.get_origin(kind) is typing.Literal
         metavar = "|".join(kinds) if literal else " ".join(_METAVARS[each] for each in kinds)
         option = f"{', '.join([*SHORTCUTS.get(name, []), f'--{name}'])} {metavar}"
-        text = ": ".join(filter(None, texts)) + (f" [{shown}]" if shown else "")
         first, others = f"  {option:<38}  ", " " * 42
+        text += f" [{shown}]" if shown else ""
         lines += textwrap.wrap(text, 120, initial_indent=first, subsequent_indent=others, break_on_hyphens=False)
     return "\n".join(lines)
 

@@ -1,4 +1,4 @@
-"""The pictures of docs/how-it-works.md that show what the passes leave (docs/tools/passes.py)."""
+"""The pictures of docs/how-it-works.md that show what the passes leave (docs/tools/pass_pictures.py)."""
 
 import itertools
 import runpy
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lapgs_wgpu import Camera
 from lapgs_wgpu.gpu.device import Device
 
-passes = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "docs/tools/passes.py")))
+passes = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "docs/tools/pass_pictures.py")))
 
 
 def panels(picture: NDArray[np.uint8], count: int) -> list[NDArray[np.int64]]:

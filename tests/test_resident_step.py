@@ -97,12 +97,12 @@ def by_resident(trainer: Trainer, task: Task) -> dict[str, Tensor]:
 def by_torch(trainer: Trainer, sample: Task, *, moving: bool) -> dict[str, Tensor]:
     nearby = times = None
     smooth = trainer.config.smoothness
-    if sample.near is not None:
+    if sample.near.count:
         chosen, offsets = sampled_rows.rows(sample.near), sampled_rows.offsets(sample.near)
         nearby = Nearby(chosen, offsets, sample.near_time, smooth.static, smooth.temporal)
-    if sample.even is not None:
+    if sample.even.count:
         times = TimeSamples(sampled_rows.rows(sample.even), sample.even_times)
-    trainer._exchange._descend(Scheduled(4, moving, 1.0, seen=True), sample.view, nearby, times)
+    trainer._exchange._descend(Scheduled(4, moving, 1.0, seen=True), sample.view, sample.time, nearby, times)
     scene = trainer.scene
     named = {**scene.parameters, **(dict(scene.field.named_parameters()) if scene.field else {})}
     gradients = {name: torch.zeros_like(p) if p.grad is None else p.grad for name, p in named.items()}
@@ -123,7 +123,7 @@ def test_gradients_are_those_of_torch(device: Device, dataset: Dataset, kind: st
         disturb(trainer)
     resident = trainers[0]._resident
     task = resident._task(Scheduled(4, moving, 1.0, seen=True))
-    assert (task.near is not None) == (task.even is not None) == moving
+    assert bool(task.near.count) == bool(task.even.count) == moving
     mine, expected = by_resident(trainers[0], task), by_torch(trainers[1], task, moving=moving)
     assert mine.keys() == expected.keys()
     # SwiftShader's exp is off by more, which the losses' signs of small differences make larger.

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from passes import SIZE, blending, discovery, motion, projected, tiles
+from pass_pictures import SIZE, blending, discovery, motion, projected, tiles
 from PIL import Image
 
 from lapgs_wgpu import load

@@ -19,7 +19,7 @@ from lapgs_wgpu.data.poses import place_of
 from lapgs_wgpu.data.readers import apps, colmap, hypernerf, panoptic, poses_bounds, transforms
 from lapgs_wgpu.data.stamps import by_camera, natural_key
 from lapgs_wgpu.data.timestamps import as_one_camera, disorder, held_out, in_step, read_times
-from lapgs_wgpu.data.validation import check_cloud, check_frames, check_plausible, check_views, upright
+from lapgs_wgpu.data.validation import check_frames, check_plausible, check_views, upright, usable_cloud
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
@@ -78,7 +78,7 @@ def load_dataset(
         if capture.own_footage:
             named = {view.camera: frame.name.file for view, frame in zip(views, frames, strict=True)}
             warnings += check_views(cloud, named, capture.source)
-        cloud = check_cloud(cloud, cameras, capture.source, warnings)
+        cloud = usable_cloud(cloud, cameras, capture.source, warnings)
         if movers is not None:
             by_time = sorted(training, key=lambda view: view.time)
             moving = mover_cube(cloud, [(view.camera, view.moving) for view in by_time if view.moving is not None])

@@ -124,7 +124,7 @@ def check_frames(frames: Sequence[Frame]) -> None:
             )
 
 
-def check_cloud(cloud: Cloud, cameras: Sequence[Camera], path: Path, warnings: list[str]) -> Cloud:
+def usable_cloud(cloud: Cloud, cameras: Sequence[Camera], path: Path, warnings: list[str]) -> Cloud:
     """Check that a cloud and the training cameras use the same coordinates and scale. Raises InputError.
 
     Returns the cloud; of a scan that reaches far beyond what the cameras see, only what they see, with a warning.

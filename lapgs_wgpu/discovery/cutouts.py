@@ -61,7 +61,7 @@ def cutout_tracks(
     rest, least = masks.copy(), LEAST * masks[0].size
     cutouts: list[_Cutout] = []
     sizes = masks.sum(axis=(1, 2))
-    enough = np.maximum(ENOUGH * sizes, least)
+    enough, searched = np.maximum(ENOUGH * sizes, least), np.zeros(len(masks), bool)
     while len(cutouts) < MOST and (sizes > enough).any():
         key = int(np.argmax(sizes))
         labels, count = ndimage.label(ndimage.binary_opening(masks[key]))
@@ -71,8 +71,8 @@ def cutout_tracks(
                 rows, columns = np.nonzero(part)
                 cutouts.append(_followed(levels, masks, key, np.stack([columns, rows], axis=1)))
                 rest &= ~cutouts[-1].explained
-        enough[key] = np.inf
-        sizes = np.where(np.isinf(enough), 0, rest.sum(axis=(1, 2)))
+        searched[key] = True
+        sizes = np.where(searched, 0, rest.sum(axis=(1, 2)))
     if not cutouts:
         return None, 0.0
     ground = [_depths(mask, depth) for mask, depth in zip(masks, depths, strict=True)]
@@ -88,7 +88,7 @@ def cutout_tracks(
     _show_nearest(cutouts, seen)
     keys = np.array([cutout.key for cutout in cutouts])
     ahead = np.mean([each.camera.T_cam_world[2, :3] for each in residuals], axis=0).astype(np.float32)
-    apart = np.linspace(*APART, len(cutouts), dtype=np.float32)[np.argsort(np.argsort(keys))]
+    apart = np.linspace(*APART, len(cutouts), dtype=np.float32)[np.argsort(np.argsort(keys))]  # by rank in time
     positions = (paths - way[:, None])[keys[number], np.arange(len(number))]
     positions += half_side * apart[number][:, None] * ahead - positions.mean(axis=0)
     return Tracks(positions, colors, number, paths, seen[:, number]), float((masks & ~rest).sum() / masks.sum())

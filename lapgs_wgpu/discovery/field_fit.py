@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy import ndimage
+from torch import Tensor
 
 from lapgs_wgpu.discovery.residual import Floats
 from lapgs_wgpu.discovery.tracks import Tracks
@@ -63,14 +64,8 @@ def fit_field(
     paths, supported = torch.from_numpy(tracks.paths), torch.from_numpy(tracks.supported)
     beside = torch.from_numpy(ndimage.maximum_filter1d(tracks.supported, 3, axis=0)).float()
     canonical, codes = scene.parameters["means"].detach(), scene.parameters.get("dynamics")
+    first, count, shades = _bodies(scene, tracks, light)
     asked = torch.arange(len(tracks.part))
-    first, count = torch.arange(len(asked)), torch.ones_like(asked)  # of the points of its body, for each
-    shades = torch.zeros(*tracks.paths.shape[:2], 3)
-    for k, factors in light.items():
-        body = np.flatnonzero(tracks.part == k)
-        first[body], count[body] = int(body[0]), len(body)
-        colors = CONSTANTS["SH_OFFSET"] / CONSTANTS["SH_C0"] + scene.parameters["sh_dc"].detach()[still + body, 0]
-        shades[:, body] = (torch.from_numpy(factors)[..., None] - 1) * colors
     order: list[int] = []
     errors: list[float] = []
     at_once, most = (8, MOVING // 2) if fades else (1, MOVING)  # times that a step looks at, and Gaussians
@@ -127,6 +122,21 @@ def fit_field(
         progress(step + 1)
     optimizer.zero_grad()
     return float(np.mean(errors[-max(1, steps // 10) :]))
+
+
+def _bodies(scene: Scene4D, tracks: Tracks, light: Mapping[int, Floats]) -> tuple[Tensor, Tensor, Tensor]:
+    """Of each point of the tracks (n,): the first point of its body, and how many that has; and how much light adds to
+    its color (T, n, 3). A point of no body is one of its own, without light."""
+    n = len(tracks.part)
+    first, count, shades = torch.arange(n), torch.ones(n, dtype=torch.int64), torch.zeros(*tracks.paths.shape[:2], 3)
+    for k, factors in light.items():
+        body = np.flatnonzero(tracks.part == k)
+        first[body], count[body] = int(body[0]), len(body)
+        colors = (
+            CONSTANTS["SH_OFFSET"] / CONSTANTS["SH_C0"] + scene.parameters["sh_dc"].detach()[len(scene) - n + body, 0]
+        )
+        shades[:, body] = (torch.from_numpy(factors)[..., None] - 1) * colors
+    return first, count, shades
 
 
 def _tell_times(field: GridField, generator: torch.Generator) -> None:

@@ -47,17 +47,17 @@ def rigid_tracks(
     others = ~np.isin(stands[tracks.part], parts)
     R0 = torch.from_numpy(np.stack([rotations[k] for k in parts], axis=1)).float()
     centers = torch.from_numpy(np.stack([tracks.center(k) for k in parts], axis=1))
-    soft_paths, soft_colors = torch.from_numpy(tracks.paths[:, others]), torch.from_numpy(tracks.colors[others])
+    other_paths, other_colors = torch.from_numpy(tracks.paths[:, others]), torch.from_numpy(tracks.colors[others])
     count = len(parts) * POINTS
     size = torch.log(SPACING * (4 * np.pi / POINTS) ** 0.5 * radii).repeat_interleave(POINTS)
-    soft_size = torch.full((len(soft_colors),), float(size.mean()))
-    quats = torch.tensor([1.0, 0, 0, 0]).repeat(count + len(soft_size), 1)
+    other_size = torch.full((len(other_colors),), float(size.mean()))
+    quats = torch.tensor([1.0, 0, 0, 0]).repeat(count + len(other_size), 1)
     around = {name: torch.from_numpy(parabolas(times, 1.0, spread)).float() for name, spread in SPREADS.items()}
     values = {
         "points": torch.from_numpy(directions(POINTS)).float() * radii[:, None, None],
-        "colors": torch.cat([torch.full((count, 3), 0.4), soft_colors]),
-        "sizes": torch.cat([size, soft_size]),
-        "opacities": torch.full((count + len(soft_size),), 3.0),
+        "colors": torch.cat([torch.full((count, 3), 0.4), other_colors]),
+        "sizes": torch.cat([size, other_size]),
+        "opacities": torch.full((count + len(other_size),), 3.0),
         "light": torch.eye(9)[0].repeat(len(parts), 1),
         "turns": torch.zeros(len(times), len(parts), 3),
         "shifts": torch.zeros(len(times), len(parts), 3),
@@ -86,8 +86,8 @@ def rigid_tracks(
             group["lr"] = RATES[group["name"]] * max(LAST, min(1.0, 2.0 * (STEPS - step) / STEPS))
         R, center = poses(at)
         arms = values["points"] @ R.transpose(1, 2)
-        means = torch.cat([(arms + center[:, None]).reshape(-1, 3), soft_paths[at]])
-        lit = torch.cat([light_on(arms).reshape(-1, 1), torch.ones(len(soft_size), 1)])
+        means = torch.cat([(arms + center[:, None]).reshape(-1, 3), other_paths[at]])
+        lit = torch.cat([light_on(arms).reshape(-1, 1), torch.ones(len(other_size), 1)])
         shapes = means, quats, values["sizes"].exp()[:, None].repeat(1, 3), values["opacities"].sigmoid()
         drawn = rasterize(*shapes, values["colors"] * lit, image.camera, antialiased=True, depth=False, device=device)
         picture = drawn.image + (1 - drawn.alpha)[..., None] * torch.from_numpy(image.still)
@@ -102,7 +102,7 @@ def rigid_tracks(
             for n in range(len(parts)):
                 where = image.moving_within(middles[n], reach[n])
                 errors[:, n] += [each[where].sum() for each in absolute]
-    rigid = errors[1] < UNEXPLAINED * errors[0]
+    rigid = errors[1] < UNEXPLAINED * errors[0]  # which of the parts are bodies
     with torch.no_grad():
         R, center = poses(slice(None))
         paths = values["points"] @ R.transpose(2, 3) + center[:, :, None]

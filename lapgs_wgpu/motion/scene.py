@@ -167,24 +167,18 @@ class Scene4D:
 
         timing: takes the place of the scene's; with EVEN, t is the field's own time.
         """
+        t = (timing or self.timing)(t)
         if self.on_device is not None and not torch.is_grad_enabled():
-            return self.on_device((timing or self.timing)(t))
-        return self.deformed(t, timing=timing).gaussians
+            return self.on_device(t)
+        return self.deformed(t).gaussians
 
-    def deformed(
-        self,
-        t: float,
-        nearby: Nearby | None = None,
-        time_samples: TimeSamples | None = None,
-        *,
-        timing: Timing | None = None,
-    ) -> Deformed:
-        """The Gaussians at time t, with what the losses of motion compare; t, timing and derivatives are those of `at`.
+    def deformed(self, t: float, nearby: Nearby | None = None, time_samples: TimeSamples | None = None) -> Deformed:
+        """The Gaussians at a time t of the field, activated, with what the losses of motion compare. Differentiable as
+        in `at`.
 
         nearby: where the smoothness loss looks; None without it. time_samples: some of the Gaussians and further times
         of the field.
         """
-        t = (timing or self.timing)(t)
         p = self.parameters
         canonical = self.canonical()
         if self.field is None or len(self) == 0:

@@ -84,25 +84,25 @@ def render_loss(
             value, gradient = torch_loss(term, image, truth, weight)
             own_values.append(value)
             d_image.write(d_image.read() + gradient)
-        rows = []
+        d_small = []  # of the correction, then of the camera, where they are asked for
         if corrections is not None:
             with Commands(device) as commands:
                 d_image, d_correction = expose_bwd(commands, losses.pool, drawing.image, d_image, corrections)
-            rows.append(d_correction)
+            d_small.append(d_correction)
         back = rasterizer.backward(drawing, d_image, camera=camera_change is not None)
-        rows += [] if back.camera is None else [back.camera]
-        read = iter(read_all([sums, drawing.splats, *back.arrays(), *rows, *drawing.needed]))
+        d_small += [] if back.camera is None else [back.camera]
+        read = iter(read_all([sums, drawing.splats, *back.arrays(), *d_small, *drawing.needed]))
         values, splats, d_gaussians = next(read), next(read), [next(read) for _ in back.arrays()]
-        d_rows = [next(read) for _ in rows]
+        small = [next(read) for _ in d_small]
         # Where the intersections did not fit, none of this is right, and all of it is done again.
         if not rasterizer.grow_on_overflow(drawing, list(read)):
             break
     by_gaussians, d_means2d = gradient_tensors(d_gaussians, gaussians.opacities.detach())
     by_correction = by_camera = None
     if correction is not None:
-        by_correction = correction.new_tensor(d_rows[0].sum(axis=0, dtype=np.float64))
+        by_correction = correction.new_tensor(small[0].sum(axis=0, dtype=np.float64))
     if camera_change is not None:
-        by_rotation, by_center = camera_gradient(d_rows[-1])
+        by_rotation, by_center = camera_gradient(small[-1])
         by_camera = camera_change.new_tensor([*by_rotation, *(camera_unit * by_center)])
     radii, means2d = radii_and_centres(splats, gaussians.means.device)
     means2d.requires_grad_()
@@ -111,8 +111,8 @@ def render_loss(
     gradients = (*by_gaussians, by_correction, by_camera, d_means2d)
     differentiable = (*gaussians.arrays().values(), correction, camera_change, means2d)
     loss = _Computed.apply(float(np.dot(computed, [*factors.values()])), gradients, *differentiable)
-    found = zip(factors.items(), computed.tolist(), strict=True)
-    terms = {name: value for (name, factor), value in found if factor or name in ("l1", "mse")}
+    named_values = zip(factors.items(), computed.tolist(), strict=True)
+    terms = {name: value for (name, factor), value in named_values if factor or name in ("l1", "mse")}
     return RenderLoss(loss, terms, radii, means2d)
 
 
@@ -144,9 +144,10 @@ class ExchangeStep:
         Raises NumericalError where a parameter is not finite.
         """
         step, view = scheduled.step, self._draws.next()
-        compared = self._compared(scheduled, self._scene.timing(view.time))
+        t = self._scene.timing(view.time)
+        compared = self._compared(scheduled, t)
         self._learners.zero_grad()
-        measured, rendering = self._descend(scheduled, view, *compared)
+        measured, rendering = self._descend(scheduled, view, t, *compared)
         d_means2d = rendering.means2d.grad
         assert d_means2d is not None
         began()
@@ -177,12 +178,12 @@ class ExchangeStep:
         return nearby, time_samples
 
     def _descend(
-        self, scheduled: Scheduled, view: View, nearby: Nearby | None, time_samples: TimeSamples | None
+        self, scheduled: Scheduled, view: View, t: float, nearby: Nearby | None, time_samples: TimeSamples | None
     ) -> tuple[Measured, RenderLoss]:
-        """Add the gradients of a view's loss to those of all that learns."""
+        """Add the gradients of a view's loss, at a time of the field, to those of all that learns."""
         config, scene, moving = self._config, self._scene, scheduled.moving
         learners, truth = self._learners, self._draws.truth
-        now = scene.deformed(view.time, nearby, time_samples) if moving else Deformed(scene.canonical(), None, [])
+        now = scene.deformed(t, nearby, time_samples) if moving else Deformed(scene.canonical(), None, [])
         weights = config.loss.weights(warm=moving)
         weighted = [(term, weight) for term in learners.parts.losses if (weight := term.weight_at(scheduled.step))]
         of_image = [(term, weight) for term, weight in weighted if not isinstance(term, Regularizer)]
@@ -203,7 +204,7 @@ class ExchangeStep:
             of_motion["smoothness"] = now.smoothness
         if time_samples is not None:
             weight = config.acceleration.weight * config.acceleration.interval
-            of_motion["acceleration"] = weight * acceleration_loss(now, scene.timing(view.time), time_samples)
+            of_motion["acceleration"] = weight * acceleration_loss(now, t, time_samples)
         if moving and config.loss.dynamics and "dynamics" in scene.parameters:
             of_motion["dynamics"] = config.loss.dynamics * dynamics_loss(scene.parameters["dynamics"])
         for term, weight in weighted:

@@ -85,8 +85,8 @@ image_loss_of = functools.cache(ImageLoss)  # that of a device, whose buffers se
 
 
 class _Frame:
-    """The passes of an image. ncc_windows, sizes: 0 and empty without the loss. arrays: by the names of the bindings in
-    the next pass; ssim, ncc and pyramid are what these losses leave for the gradient."""
+    """The passes of an image. ncc_windows, sizes: 0 and empty without the loss. arrays: that several passes bind, by
+    the names of the bindings; ssim, ncc and pyramid are what these losses leave for the gradient."""
 
     def __init__(self, owner: ImageLoss, commands: Commands, height: int, width: int, weights: LossWeights) -> None:
         self.device, self.pool, self.lanes, self.length = owner.device, owner.pool, owner._lanes, owner._run
@@ -122,85 +122,81 @@ class _Frame:
     def kernel(self, name: str, **defines: bool) -> Kernel:
         return Kernel.get(self.device, name, LANES=self.lanes, **defines)
 
-    def run(self, name: str, grid: tuple[int, int], **defines: bool) -> None:
-        """Record a pass with those of the arrays that it binds."""
-        kernel = self.kernel(name, **defines)
-        self.commands.dispatch_grid(kernel, grid, **{binding: self.arrays[binding] for binding in kernel.bindings})
+    def run(self, name: str, grid: tuple[int, int], arrays: dict[str, DeviceArray], **defines: bool) -> None:
+        """Record a pass with those of the image's arrays, and of these further ones, that it binds."""
+        kernel, arrays = self.kernel(name, **defines), self.arrays | arrays
+        self.commands.dispatch_grid(kernel, grid, **{binding: arrays[binding] for binding in kernel.bindings})
 
     def pixels(self, image: DeviceArray, rgba: DeviceArray) -> None:
-        self.arrays |= {"image": image, "rgba": rgba, "pixels": self.pool.array("pixels", (self.places, 4), "uint32")}
-        self.run("loss_pixels", (1, self.height))
+        self.arrays |= {"image": image, "pixels": self.pool.array("pixels", (self.places, 4), "uint32")}
+        self.run("loss_pixels", (1, self.height), {"rgba": rgba})
 
     def ssim(self) -> None:
         """By the blurs; leaves their slopes blurred along the rows."""
-        self.arrays["moments"] = self.pool.array("ssim moments", (3, self.places_across, 4))
-        self.arrays["ssim"] = self.arrays["slopes"] = self.pool.array("ssim slopes", (3, self.places, 4))
-        self.run("loss_ssim_down", self.grid(self.width, self.height, channels=3))
-        self.run("loss_ssim_across", self.grid(self.height, self.width, channels=3))
+        moments = self.pool.array("ssim moments", (3, self.places_across, 4))
+        slopes = self.arrays["ssim"] = self.pool.array("ssim slopes", (3, self.places, 4))
+        self.run("loss_ssim_down", self.grid(self.width, self.height, channels=3), {"moments": moments})
+        across = self.grid(self.height, self.width, channels=3)
+        self.run("loss_ssim_across", across, {"moments": moments, "slopes": slopes})
 
     def ncc(self) -> None:
         """By the luminance. moments: of pixels below each other; slopes: the derivatives, summed along the rows."""
         rows = self.height - NCC_WINDOW + 1
-        self.arrays |= {name: self.pool.array(f"ncc {name}", (self.places, 4)) for name in ("moments", "slopes")}
-        self.arrays["truth_variances"] = self.pool.array("ncc truth variances", (self.places,))
-        self.arrays["ncc"] = self.arrays["d_luminance"] = self.pool.array("d_luminance", (self.places,))
-        self.run("loss_ncc_down", self.grid(self.width, rows))
-        self.run("loss_ncc_across", self.grid(rows, self.width))
-        self.run("loss_ncc_up", self.grid(self.width, self.height))
+        arrays = {name: self.pool.array(f"ncc {name}", (self.places, 4)) for name in ("moments", "slopes")}
+        arrays["truth_variances"] = self.pool.array("ncc truth variances", (self.places,))
+        self.arrays["ncc"] = arrays["d_luminance"] = self.pool.array("d_luminance", (self.places,))
+        self.run("loss_ncc_down", self.grid(self.width, rows), arrays)
+        self.run("loss_ncc_across", self.grid(rows, self.width), arrays)
+        self.run("loss_ncc_up", self.grid(self.width, self.height), arrays)
 
     def pyramid(self) -> None:
         """By the difference: down to the residual, and from there up."""
-        arrays, bands = self.arrays, len(self.sizes) - 1
+        bands = len(self.sizes) - 1
         weights = zip(pyramid_weights(bands + 1), self.sizes, strict=True)
         shares = [weight / (3 * height * width) for weight, (height, width) in weights]
         first, levels = self.ends[2], list[tuple[DeviceArray, DeviceArray]]()  # uniform and signs of each
-        arrays["fine"] = arrays["pixels"]
+        fine = self.arrays["pixels"]
         for k in range(bands):
             (fine_height, fine_width), (height, width) = self.sizes[k : k + 2]
-            content = self.kernel("loss_pyramid_band", FINEST=k == 0, RESIDUAL=k == bands - 1).uniform(
-                "Level",
-                fine=(fine_width, fine_height),
-                coarse=(width, height),
-                run=self.length,
-                first=first,
-                value=shares[k],
-                slope=shares[k] * self.weights.pyramid,
-                coarse_value=shares[k + 1],
-                coarse_slope=shares[k + 1] * self.weights.pyramid,
-            )
+            sizes = {"fine": (fine_width, fine_height), "coarse": (width, height)}
+            values = {"value": shares[k], "coarse_value": shares[k + 1]}
+            slopes = {"slope": shares[k] * self.weights.pyramid, "coarse_slope": shares[k + 1] * self.weights.pyramid}
+            kernel = self.kernel("loss_pyramid_band", FINEST=k == 0, RESIDUAL=k == bands - 1)
+            content = kernel.uniform("Level", run=self.length, first=first, **sizes, **values, **slopes)
             signs = self.pool.array(f"signs {k}", (fine_height, fine_width), "uint32")
-            levels.append((self.pool.constant(content), signs))
-            arrays["level"], arrays["signs"] = levels[k]
-            arrays["coarse"] = self.pool.array(f"level {k + 1}", (height, width, 4))
-            self.run("loss_pyramid_reduce", (-(-width // self.lanes), height), FINEST=k == 0)
-            self.run("loss_pyramid_band", self.grid(width, height), FINEST=k == 0, RESIDUAL=k == bands - 1)
+            level, coarse = self.pool.constant(content), self.pool.array(f"level {k + 1}", (height, width, 4))
+            arrays = {"level": level, "signs": signs, "fine": fine, "coarse": coarse}
+            self.run("loss_pyramid_reduce", (-(-width // self.lanes), height), arrays, FINEST=k == 0)
+            self.run("loss_pyramid_band", self.grid(width, height), arrays, FINEST=k == 0, RESIDUAL=k == bands - 1)
+            levels.append((level, signs))
             first += self.pyramid_counts[k]
-            arrays["fine"] = arrays["difference"] = arrays["coarse"]
+            fine = coarse
+        arrays = {"difference": fine}  # the residual
         for k in range(bands, 0, -1):
             height, width = self.sizes[k]
+            arrays["d_level"] = self.pool.array(f"d_level {k}", (height, width, 4))
             arrays["above"], arrays["fine_signs"] = levels[k - 1]
             if k < bands:
                 arrays["below"], arrays["signs"] = levels[k]
-            arrays["d_level"] = self.pool.array(f"d_level {k}", (height, width, 4))
-            self.run("loss_pyramid_bwd", (-(-width // self.lanes), height), RESIDUAL=k == bands)
+            self.run("loss_pyramid_bwd", (-(-width // self.lanes), height), arrays, RESIDUAL=k == bands)
             arrays["d_coarse"] = arrays["d_level"]
+        self.arrays["pyramid"] = arrays["d_difference"] = self.pool.array("d_difference", (self.places, 4))
         arrays["level"], arrays["signs"] = levels[0]
-        arrays["pyramid"] = arrays["d_difference"] = self.pool.array("d_difference", (self.places, 4))
         height, width = self.sizes[1]
-        self.run("loss_pyramid_finest", (-(-width // self.lanes), height), FINEST=True)
+        self.run("loss_pyramid_finest", (-(-width // self.lanes), height), arrays, FINEST=True)
 
     def sum_up(self) -> DeviceArray:
         """The terms."""
         names = ("l1", "squared", "ssim", "pyramid", "ncc")
-        parts = dict(zip(names, zip([0, *self.ends], self.ends, strict=False), strict=True))
-        self.arrays["parts"] = self.pool.constant(self.kernel("loss_sums").uniform("Parts", **parts))
-        self.arrays["terms"] = self.pool.array("terms", (TERMS,))
-        self.run("loss_sums", (TERMS, 1))
-        return self.arrays["terms"]
+        ends = dict(zip(names, zip([0, *self.ends], self.ends, strict=False), strict=True))
+        parts = self.pool.constant(self.kernel("loss_sums").uniform("Parts", **ends))
+        terms = self.pool.array("terms", (TERMS,))
+        self.run("loss_sums", (TERMS, 1), {"parts": parts, "terms": terms})
+        return terms
 
     def gradient(self) -> DeviceArray:
         """By the image."""
-        self.arrays["d_image"] = self.pool.array("d_image", (4, self.height, self.width))
+        d_image = self.pool.array("d_image", (4, self.height, self.width))
         flags = {name.upper(): name in self.arrays for name in ("ssim", "ncc", "pyramid")}
-        self.run("loss_gradient", self.grid(self.width, self.height, channels=3), **flags)
-        return self.arrays["d_image"]
+        self.run("loss_gradient", self.grid(self.width, self.height, channels=3), {"d_image": d_image}, **flags)
+        return d_image

@@ -89,12 +89,13 @@ def _shorthands(method: str | None, ablate: Iterable[str]) -> dict[str, Any]:
     return values
 
 
-def config_keys(cls: type = Config, prefix: str = "") -> dict[str, Any]:
-    """Dotted name of every key of the configuration -> its type."""
-    keys: dict[str, Any] = {}
+def config_keys(cls: Any = Config, prefix: str = "", said: str = "") -> dict[str, tuple[Any, str]]:
+    """Dotted name of every key of the configuration -> its type and its help. prefix, said: before those of `cls`."""
+    keys: dict[str, tuple[Any, str]] = {}
     for name, kind in field_types(cls).items():
+        text = ": ".join(filter(None, (said, cls.__dataclass_fields__[name].metadata.get("help"))))
         inner = dataclasses.is_dataclass(kind)
-        keys |= config_keys(kind, f"{prefix}{name}.") if inner else {f"{prefix}{name}": kind}
+        keys |= config_keys(kind, f"{prefix}{name}.", text) if inner else {f"{prefix}{name}": (kind, text)}
     return keys
 
 

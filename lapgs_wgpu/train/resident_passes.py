@@ -1,6 +1,5 @@
 """The passes of a step that stays on the device, from parameters to parameters, recorded once and replayed."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,7 +12,7 @@ from lapgs_wgpu.gpu.matmul import sum_columns
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.passes.activation_passes import ActivationPasses, Line
 from lapgs_wgpu.motion.passes.grid_field_passes import Decoding, FieldArrays, GridFieldPasses
-from lapgs_wgpu.motion.passes.samples import Samples
+from lapgs_wgpu.motion.passes.samples import NO_SAMPLES, Samples
 from lapgs_wgpu.splat.drawing import Drawing, GaussianGradients
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterizer_of
@@ -35,7 +34,7 @@ class Task:
 
     scheduled: what the schedule says. before: where the draws stood before its view. view: of the training. time: of
     the field. sh_degree: of the harmonics in use. rates: of the optimizer's groups, and of FREQUENCIES. near,
-    near_time: the places and the time that the smoothness loss compares; None in steps without it. even, even_times:
+    near_time: the places and the time that the smoothness loss compares; none in steps without it. even, even_times:
     those of the acceleration loss. Once it was submitted: counts, how many steps had moved each tensor before; drawing;
     later, what it tells; once it is settled: measured.
     """
@@ -46,9 +45,9 @@ class Task:
     time: float
     sh_degree: int
     rates: dict[str, float]
-    near: Samples | None = None
+    near: Samples = NO_SAMPLES
     near_time: float = 0.0
-    even: Samples | None = None
+    even: Samples = NO_SAMPLES
     even_times: tuple[float, float] = (0.0, 0.0)
     counts: dict[str, int] = field(init=False)
     drawing: Drawing = field(init=False)
@@ -89,9 +88,9 @@ class ResidentPasses:
         weighted = zip(self._weights(task)._asdict().items(), (l1, *others), strict=True)
         found = {name: weight * value for (name, weight), value in weighted if weight or name == "l1"}
         static, temporal, even, dynamics = totals
-        if task.near is not None:
+        if task.near.count:
             found["smoothness"] = static + temporal
-        if task.even is not None:
+        if task.even.count:
             found["acceleration"] = even
         if task.scheduled.moving and self._dynamics_loss:
             found["dynamics"] = dynamics
@@ -114,7 +113,7 @@ class ResidentPasses:
         commands.copy(truth, held)
         camera = task.view.camera
         shape = (
-            *(task.scheduled.moving, task.scheduled.seen, task.near is None, task.even is None, task.sh_degree),
+            *(task.scheduled.moving, task.scheduled.seen, task.near.count > 0, task.even.count > 0, task.sh_degree),
             *(camera.width, camera.height, self.rasterizer.plan_of(camera), len(self._scene)),
             self.corrections.moves_camera,
         )
@@ -148,6 +147,8 @@ class ResidentPasses:
         self.rasterizer.backward(self.rasterizer.draw_whole(drawn, camera, gradient=True), d_image)
 
     def _record(self, commands: Commands, task: Task, truth: DeviceArray) -> Recorded:
+        """Record what is replayed in later steps of this shape: what differs between them is read from self._task, in
+        functions that are called anew at each, never from `task`."""
         for array in (self._bad, self._totals):
             commands.clear(array)
         passes, field, corrections = self._activation, self._field, self.corrections
@@ -162,7 +163,7 @@ class ResidentPasses:
         d_image = corrections.expose_bwd(commands, drawing.image, d_image)
         by_drawn = self.rasterizer.record_bwd(commands, drawing, d_image, camera=corrections.moves_camera)
         corrections.sum_camera(commands, by_drawn.camera)
-        if task.even is not None:
+        if task.even.count:
             scale = even.weight * even.interval / task.even.count
             line = Line(decodings[0], decodings[1], decodings[2], scale)
             accelerations = passes.acceleration(commands, line, values, drawn, by_drawn, gradients)
@@ -171,10 +172,10 @@ class ResidentPasses:
         if field is not None and now is not None:
             for each in decodings:
                 field.decode_bwd(commands, each, values, gradients)
-            if task.near is not None:
+            if task.near.count:
                 weights = [weight / task.near.count for weight in (smooth.static, smooth.temporal)]
-                near, times = self._of_task("near"), (now.time, self._of_task("near_time"))
-                differences = field.compare(commands, values, gradients, near, times, weights)
+                times = now.time, lambda: self._task.near_time
+                differences = field.compare(commands, values, gradients, lambda: self._task.near, times, weights)
                 for name, sums, weight in zip(TOTALS, differences, weights, strict=False):
                     self._total(commands, sums, name, weight)
             if self._dynamics_loss:
@@ -183,20 +184,15 @@ class ResidentPasses:
         return drawing, [self.guard, self._bad, terms, self._totals, *drawing.needed]
 
     def _decode(self, commands: Commands, task: Task, values: FieldArrays) -> list[Decoding]:
-        """Record the field at a step's time, and before and after it where the step has that; what varies is asked for
-        anew."""
+        """Record the field at a step's time, and before and after it where the step has that."""
         field = self._field
         if field is None or not task.scheduled.moving:
             return []
         decodings = [field.decode(commands, 0, values, lambda: self._task.time)]
-        if task.even is not None:
-            even = self._of_task("even")
-            decodings.append(field.decode(commands, 3, values, lambda: self._task.even_times[0], even))
-            decodings.append(field.decode(commands, 4, values, lambda: self._task.even_times[1], even))
+        if task.even.count:
+            for number, time in ((3, lambda: self._task.even_times[0]), (4, lambda: self._task.even_times[1])):
+                decodings.append(field.decode(commands, number, values, time, lambda: self._task.even))
         return decodings
-
-    def _of_task(self, name: str) -> Callable[[], Any]:
-        return lambda: getattr(self._task, name)
 
     def _activate(self, commands: Commands, degree: int, decoding: Decoding | None) -> Gaussians[DeviceArray]:
         values, antialiased = self.parameters.arrays("value"), self._scene.antialiased

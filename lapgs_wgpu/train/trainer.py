@@ -83,17 +83,18 @@ class Trainer:
             InputError: the configuration, the data, the scene and the parts do not fit each other.
         """
         self.parts = parts or Parts()
-        self.user_config, self.config, self.dataset, device = set_up(config, dataset, device, self.parts, scene)
+        self.user_config, config, dataset, device = set_up(config, dataset, device, self.parts, scene)
         if scene is not None:
             start = Start(scene, ramp_steps=config.schedule.warm_up)
         elif start is None:
-            start = start_from_points(self.config, self.dataset, device, self.parts.field)
+            start = start_from_points(config, dataset, device, self.parts.field)
+        scene = start.scene
+        self.config, self.dataset, self.scene = config, dataset, scene
+        self.discovery, self.discovery_seconds = start.summary, start.seconds
+        self.warm_up_steps, self._ramp_steps = start.warm_up_steps, start.ramp_steps
         self.callbacks = list(self.parts.callbacks)
         self.done = 0
-        self.scene, self.discovery, self.discovery_seconds = start.scene, start.summary, start.seconds
-        self.warm_up_steps, self._ramp_steps = start.warm_up_steps, start.ramp_steps
         generator = torch.Generator().manual_seed(config.seed)
-        config, scene, dataset = self.config, self.scene, self.dataset
         backgrounds = backgrounds_of(dataset.train, config.data)
         self._truth = GroundTruth(scene.device, backgrounds, int(config.data.cache_gb * 1e9))
         self._draws = Draws(dataset.train, generator, self._truth)

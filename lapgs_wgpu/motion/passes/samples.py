@@ -27,6 +27,7 @@ class Samples:
         return -(-(self.gaussians - 1).bit_length() // 2)
 
 
+NO_SAMPLES = Samples(0, 0)
 Sampling = Callable[[], Samples]  # gives the samples of the step that is taken, whose number is the same in each
 
 
