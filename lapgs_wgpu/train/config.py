@@ -24,8 +24,8 @@ class DataConfig(Options):
     size: int = option("longer side of the images, pixels; larger images are downscaled; 0: the original size")
     background: Literal["black", "white"] = option("color behind the Gaussians and behind transparent images")
     cache_gb: float = option("memory limit for the images that are kept on the device, gigabytes")
-    undistort: bool = option("resample images of lenses with distortion or skew to those of a pinhole camera", True)
-    vary_background: bool = option("another random background for each image: surfaces become opaque", False)
+    undistort: bool = option("undo distortion and skew of lenses; false: ignore them, and the principal point", True)
+    vary_background: bool = option("another random data.background for each image: surfaces become opaque", False)
     units: Literal["world", "capture"] = option(
         "length unit of rates.means, smoothness.reach, field.bound and field.unit; capture: that of its files",
         "world",
@@ -35,7 +35,7 @@ class DataConfig(Options):
     )
     movers: str = option(
         "folder, absolute or in the capture, with a mask for each image, white where something moves: discovery looks "
-        "there alone, evaluation measures it apart, and with a point cloud it fills the cube (lapgs-prepare: masks)",
+        "there alone, evaluation measures it apart, and a point cloud's cube is fitted to it (lapgs-prepare: masks)",
         "",
     )
     path: str = option(
@@ -189,7 +189,7 @@ class AccelerationConfig(Options):
 
     weight: float = option(
         "weight of the acceleration loss: distance of means and scales from the line between before and after; 0, "
-        "or nearly all moves: off",
+        "or discovery found nearly all motion: off",
         0.0,
     )
     share: float = option("fraction of the Gaussians that are sampled each time", 0.25, at_most=1)
@@ -201,12 +201,12 @@ class DiscoveryConfig(Options):
     """Motion discovery before the training (docs/method.md). Has defaults, since older config.toml files lack it."""
 
     enabled: bool = option(
-        "before training, search for objects that move farther than their own size, and start from them; skipped for "
-        "the field static and if schedule.steps is at most discovery.steps",
+        "search for objects that move farther than their own size, and start from them; not for the field static, nor "
+        "if schedule.steps is at most discovery.steps. Limits rates.hash and rates.mlp where it finds nearly all",
         False,
     )
-    steps: int = option("training steps of the static fit that discovery begins with", 800, at_least=1)
-    size: int = option("longer side of the images for discovery, pixels", 100, at_least=16)
+    steps: int = option("steps of the static fit before discovery; cameras all around: none", 800, at_least=1)
+    size: int = option("longer side of the images for discovery, pixels; cameras all around: 160", 100, at_least=16)
     field_steps: int = option("steps that fit a field to what was found; on a rig at least 30 a time", 1500, at_least=1)
     least: float = option(
         "start without what was found where it covers less than this fraction of what moves",
@@ -240,7 +240,7 @@ class CamerasConfig(Options):
         "how far a step moves a camera, as the angle by which its image then moves, radians", Rate(4e-3, 2e-4, 3_000)
     )
     pull: float = option("weight decay of the corrections, relative to the learning rate", 0.1, at_least=0)
-    start: int = option("first step that corrects cameras; 1 if discovery corrected them", 300, at_least=1)
+    start: int = option("first step that corrects cameras; if discovery did: 1, all at rate.end", 300, at_least=1)
 
 
 @dataclass(frozen=True)
@@ -298,7 +298,7 @@ class Config(Options):
     step_place: Literal["auto", "exchange", "resident"] = option(
         "where a training step is computed; resident: on the device from end to end, where its parameters stay; "
         "exchange: by torch, which exchanges buffers with the device; auto: exchange on CPU devices and for what only "
-        "torch computes (fields other than static, grid4d and laplacian), else resident",
+        "torch computes (mlp, hexplane, own; field.motion mlp, field.depth > 0), else resident",
         "auto",
     )
 

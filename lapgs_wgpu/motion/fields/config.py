@@ -96,7 +96,7 @@ class FieldConfig(Options):
         "initial spacing of the spectrum's frequencies, which start at 0, cycles per clip", 1.0, above=0, below=1e6
     )
     amplitude: float = option(
-        "how strongly the spectrum acts at first: standard deviation of its sum of sinusoids over time",
+        "initial standard deviation over time of the spectrum's sums of sinusoids, which scale the decoder's features",
         0.3,
         above=0,
         below=1e6,
