@@ -14,7 +14,7 @@ from PIL import Image
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.placement import mover_cube
-from lapgs_wgpu.data.views import composite, small_views
+from lapgs_wgpu.data.views import View, composite, small_views
 from lapgs_wgpu.discovery.cutouts import cutout_tracks
 from lapgs_wgpu.discovery.discover import start_training
 from lapgs_wgpu.discovery.residual import Residual
@@ -103,13 +103,17 @@ def test_masks_are_completed_by_what_differs_beside_them() -> None:
 
 def test_the_cube_of_movers_holds_them_and_not_the_room() -> None:
     points, colors = room_cloud(400, 0.0)
-    seen = [(camera, lambda mask=mask: mask) for camera, (_, mask) in zip(CAMERAS, TAKEN, strict=True)]
+
+    def view(camera: Camera, mask: np.ndarray) -> View:
+        return View("", camera, 0.0, "", dict, moving=lambda: mask)
+
+    seen = [view(camera, mask) for camera, (_, mask) in zip(CAMERAS, TAKEN, strict=True)]
     cube = mover_cube(Cloud(points, colors.astype(np.float32)), seen)
     assert cube is not None
     room = np.ptp(points, axis=0).max() / 2
     assert 0.4 < cube.half < 0.8 * room
-    empty = [(CAMERAS[0], lambda: np.zeros((96, 128), bool))]
-    assert mover_cube(Cloud(points, colors.astype(np.float32)), empty) is None
+    empty = view(CAMERAS[0], np.zeros((96, 128), bool))
+    assert mover_cube(Cloud(points, colors.astype(np.float32)), [empty]) is None
 
 
 NEARLY, RIM = 200, 6  # level of masks of nearly everything; rows at the upper rim that stand still

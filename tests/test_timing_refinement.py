@@ -18,7 +18,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.deformation import Deformation
 from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.motion.timing import EVEN, Timing
+from lapgs_wgpu.motion.timing import EVEN
 from lapgs_wgpu.train.ground_truth import GroundTruth, HostImage
 from lapgs_wgpu.train.timing_refinement import FARTHEST, TimingRefinement, running_median
 from lapgs_wgpu.train.trainer import Trainer
@@ -56,8 +56,8 @@ def views_at(times: Sequence[float]) -> list[View]:
 
 
 def refinement(scene: Scene4D, truth: Callable[[View], Tensor], times: Sequence[float] = TIMES) -> TimingRefinement:
-    def picture(view: View, timing: Timing) -> Tensor:
-        return scene.render(view.camera, view.time, timing=timing).image
+    def picture(view: View, t: float) -> Tensor:
+        return scene.render(view.camera, t, timing=EVEN).image
 
     def image(view: View) -> HostImage:
         pixels = truth(view)
@@ -172,7 +172,7 @@ def test_it_sees_what_the_losses_see(dataset: Dataset, device: Device) -> None:
         with torch.no_grad():
             training._learners.exposures.values[0, :, 3] += 0.25
         plain = training.scene.render(first.camera, first.time, torch.zeros(3)).image
-        torch.testing.assert_close(training._picture(first, EVEN), plain + 0.25)
+        torch.testing.assert_close(training._picture(first, first.time), plain + 0.25)
         left_out = training._truth.on_host(first).left_out
         assert bool(left_out[:5].all())
         assert not left_out[5:].any()

@@ -80,8 +80,7 @@ def load_dataset(
             warnings += check_views(cloud, named, capture.source)
         cloud = usable_cloud(cloud, cameras, capture.source, warnings)
         if movers is not None:
-            by_time = sorted(training, key=lambda view: view.time)
-            moving = mover_cube(cloud, [(view.camera, view.moving) for view in by_time if view.moving is not None])
+            moving = mover_cube(cloud, training)
     capture = dataclasses.replace(capture, frames=frames, cloud=cloud)
     fit, cloud, depths = place(capture, cameras, moving, warnings)
     whole = fit if fit is None or capture.moved is None else capture.moved.then(fit)

@@ -1,7 +1,7 @@
 """Where the scene of a capture lies: its depths before the cameras, its cube, or that of what moves, from masks and a
 cloud of what stands still; and a cloud that is filled up."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from lapgs_wgpu.data.frames import Capture
 from lapgs_wgpu.data.masks import Mask
 from lapgs_wgpu.data.normalize import BOX, Cube, Normalization, cube_in_view, cube_of_points
 from lapgs_wgpu.data.poses import AXES_HINT, Array
+from lapgs_wgpu.data.views import View
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 
@@ -130,14 +131,12 @@ def _filled(cloud: Cloud, cameras: Sequence[Camera]) -> Cloud:
 # The cube of what moves
 
 
-def mover_cube(cloud: Cloud, seen: Sequence[tuple[Camera, Callable[[], Mask]]]) -> Cube | None:
-    """The cube of what moves over the clip, in the cloud's coordinates; None where nothing does or no depth is known.
-
-    seen: the camera of each image, by time, and what decodes its mask (H, W).
-    """
+def mover_cube(cloud: Cloud, views: Sequence[View]) -> Cube | None:
+    """The cube of what moves in views, in the cloud's coordinates; None where nothing does or no depth is known."""
     from scipy import ndimage  # slow to import
 
-    points = cloud.points.astype(np.float64)
+    points, by_time = cloud.points.astype(np.float64), sorted(views, key=lambda view: view.time)
+    seen = [(view.camera, view.moving) for view in by_time if view.moving is not None]
     boxes = [(camera, box) for camera, mask in evenly(seen, IMAGES) if (box := _box(camera, mask(), points))]
     if not boxes:
         return None

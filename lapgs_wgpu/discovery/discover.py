@@ -181,26 +181,26 @@ def _in_residuals(config: Config, dataset: Dataset, device: Device, generator: t
             f"{dataset.train[0].source} and the other {len(dataset.train) - 1} training images show nothing but the "
             f"{config.data.background} background; check the images and data.background."
         )
-    cutout_depths = None if dataset.is_rig else depths  # a cut-out is of one camera
-    light: dict[int, Floats] = {}
-    if cutout_depths is not None:
+    if depths is not None and not dataset.is_rig:  # a cut-out is of one camera
+        tracks, share = cutout_tracks(images, depths, half_side)
+        meter.clear()
         times = np.array([image.time for image in images])
-        tracks, share = cutout_tracks(images, cutout_depths, half_side)
-    else:
-        clouds = surface_points(images, half_side)
-        times, tracks = clouds.times, find_tracks(clouds)
-        if tracks is not None:
-            together = 2 * len(dataset.times) <= len(dataset.train)
-            tracks = tracks_in_images(tracks, times, images, static, background, together=together)
-        share = explained_share(clouds, tracks)
+        tracks = tracks if share >= config.discovery.least else None
+        return _Found(static, tracks, times, share, "a static fit", {}, sheets=True, corrections=corrections)
+    clouds = surface_points(images, half_side)
+    times, tracks, light = clouds.times, find_tracks(clouds), dict[int, Floats]()
+    if tracks is not None:
+        together = 2 * len(dataset.times) <= len(dataset.train)
+        tracks = tracks_in_images(tracks, times, images, static, background, together=together)
+    share = explained_share(clouds, tracks)
     if share < config.discovery.least:
         tracks = None
-    elif tracks is not None and cutout_depths is None:
+    elif tracks is not None:
         stands, turns = find_turns(tracks, times, images)
         if turns:
             tracks, light = rigid_tracks(tracks, stands, turns, times, images, device, generator)
     meter.clear()
-    return _Found(static, tracks, times, share, "a static fit", light, cutout_depths is not None, corrections)
+    return _Found(static, tracks, times, share, "a static fit", light, corrections=corrections)
 
 
 def tracks_in_images(

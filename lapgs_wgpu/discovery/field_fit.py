@@ -6,12 +6,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy import ndimage
-from torch import Tensor
+from torch import Tensor, nn
 
 from lapgs_wgpu.discovery.residual import Floats
 from lapgs_wgpu.discovery.tracks import Tracks
 from lapgs_wgpu.motion.fields.config import APPEARANCE_SCALE
-from lapgs_wgpu.motion.fields.deformation import TimeSamples
+from lapgs_wgpu.motion.fields.deformation import Deformation, Field, TimeSamples
 from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.splat.constants import CONSTANTS
@@ -51,13 +51,9 @@ def fit_field(
     """
     field, still = scene.field, len(scene) - len(tracks.part)
     assert field is not None
-    groups = [(HASH_RATE if name == "hash" else MLP_RATE, each) for name, each in field.parameter_groups().items()]
+    groups = _groups(field, look=fades or bool(light))
     if not groups:
         return None
-    if (fades or light) and (head := getattr(field, "appearance", None)) is not None:  # outputs in that unit
-        own = set(head.parameters())
-        groups = [(rate, [one for one in each if one not in own]) for rate, each in groups]
-        groups.append((MLP_RATE / APPEARANCE_SCALE, list(head.parameters())))
     if fades and isinstance(field, GridField) and field.config.dynamics_size > 1 and field.config.temporal_hash:
         _tell_times(field, generator)
     optimizer = torch.optim.Adam([{"params": each, "lr": rate} for rate, each in groups], eps=ADAM_EPS, fused=True)
@@ -83,7 +79,6 @@ def fit_field(
             way = way * (WITHIN + BEYOND) - BEYOND
         means = torch.cat([canonical[still + asked].lerp(canonical[still + other], way), canonical[staying]])
         dynamics = None if codes is None else codes.detach()[torch.cat([still + asked, staying])]
-        sizes = [len(asked), len(staying)]
         loss, distance = torch.zeros(()), 0.0
         first_time, *others = (float(times[at]) for at in now)
         samples = TimeSamples(torch.arange(len(means)), tuple(others)) if others else None
@@ -91,25 +86,11 @@ def fit_field(
             seen, targets = supported[at, asked], paths[at, asked].lerp(paths[at, other], way)
             squared = (move.apply_to_means(means) - torch.cat([targets, means[len(asked) :]])).square().sum(dim=1)
             far = (squared + SOFTENING**2).sqrt()
-            if fades:  # few are seen at a time; between two times, those of both
-                weights = HIDDEN + (1 - HIDDEN) * beside[at, asked]
-                of_tracks, of_still = far.split(sizes)
-                loss = loss + (weights * of_tracks).sum() / weights.sum() + of_still.mean()
+            if fades:
+                loss = loss + _sheets_loss(move, far, seen, beside[at, asked])
             else:
-                loss = loss + (torch.cat([seen.float(), torch.ones(len(staying))]) * far).mean()
-            loss = loss + SHAPE_WEIGHT * sum(
-                (weight * change).abs().mean()
-                for weight, change in ((SHEET_STIFF if fades else 1.0, move.d_scales), (1.0, move.d_quats))
-                if change is not None
-            )
-            if light and move.d_dc is not None:
-                of_tracks, of_still = move.d_dc.split(sizes)
-                shade = shades[at, asked].lerp(shades[at, other], way)
-                loss = loss + LIGHT_WEIGHT * ((of_tracks - shade).abs().mean() + of_still.abs().mean())
-            if fades and move.d_opacity is not None:
-                of_tracks, of_still = move.d_opacity.split(sizes)
-                kinds = of_tracks[seen], of_tracks[~seen] + FADED, of_still
-                loss = loss + FADE_WEIGHT * sum(each.abs().mean() for each in kinds if len(each))
+                shade = shades[at, asked].lerp(shades[at, other], way) if light else None
+                loss = loss + _parts_loss(move, far, seen, shade)
             distance += float((seen * squared[: len(asked)].detach().sqrt()).sum() / seen.sum().clamp(min=1))
         if not loss.requires_grad:
             return None
@@ -124,6 +105,48 @@ def fit_field(
     return float(np.mean(errors[-max(1, steps // 10) :]))
 
 
+def _groups(field: Field, *, look: bool) -> list[tuple[float, list[nn.Parameter]]]:
+    """What is trained, with its learning rate. look: so is what changes the Gaussians' look, in its own unit."""
+    groups = [(HASH_RATE if name == "hash" else MLP_RATE, each) for name, each in field.parameter_groups().items()]
+    if groups and look and (head := getattr(field, "appearance", None)) is not None:
+        own = set(head.parameters())
+        groups = [(rate, [one for one in each if one not in own]) for rate, each in groups]
+        groups.append((MLP_RATE / APPEARANCE_SCALE, list(head.parameters())))
+    return groups
+
+
+def _parts_loss(move: Deformation, far: Tensor, seen: Tensor, shade: Tensor | None) -> Tensor:
+    """The loss at a time. far: (n + m,) how far Gaussians of tracks, and those that stay, are from where they should
+    be. seen: (n,) whether these tracks are. shade: (n, 3) what the light adds to their colors; None where all is even.
+    """
+    still = len(far) - len(seen)
+    loss = (torch.cat([seen.float(), torch.ones(still)]) * far).mean() + _shape_loss(move, stiffness=1.0)
+    if shade is not None and move.d_dc is not None:
+        of_tracks, of_still = move.d_dc.split([len(seen), still])
+        loss = loss + LIGHT_WEIGHT * ((of_tracks - shade).abs().mean() + of_still.abs().mean())
+    return loss
+
+
+def _sheets_loss(move: Deformation, far: Tensor, seen: Tensor, beside: Tensor) -> Tensor:
+    """The loss of tracks that fade where they are not seen, as `_parts_loss`. beside: (n,) 1 for what is seen at this
+    time or at one beside it, since between two times those of both are, else 0."""
+    sizes = [len(seen), len(far) - len(seen)]
+    weights = HIDDEN + (1 - HIDDEN) * beside  # few are seen at a time
+    of_tracks, of_still = far.split(sizes)
+    loss = (weights * of_tracks).sum() / weights.sum() + of_still.mean() + _shape_loss(move, stiffness=SHEET_STIFF)
+    if move.d_opacity is not None:
+        of_tracks, of_still = move.d_opacity.split(sizes)
+        kinds = of_tracks[seen], of_tracks[~seen] + FADED, of_still
+        loss = loss + FADE_WEIGHT * sum(each.abs().mean() for each in kinds if len(each))
+    return loss
+
+
+def _shape_loss(move: Deformation, stiffness: float) -> Tensor | float:
+    """Of changes of scales, which count `stiffness` times, and of quaternions."""
+    changes = (stiffness, move.d_scales), (1.0, move.d_quats)
+    return SHAPE_WEIGHT * sum((weight * each).abs().mean() for weight, each in changes if each is not None)
+
+
 def _bodies(scene: Scene4D, tracks: Tracks, light: Mapping[int, Floats]) -> tuple[Tensor, Tensor, Tensor]:
     """Of each point of the tracks (n,): the first point of its body, and how many that has; and how much light adds to
     its color (T, n, 3). A point of no body is one of its own, without light."""
@@ -132,9 +155,8 @@ def _bodies(scene: Scene4D, tracks: Tracks, light: Mapping[int, Floats]) -> tupl
     for k, factors in light.items():
         body = np.flatnonzero(tracks.part == k)
         first[body], count[body] = int(body[0]), len(body)
-        colors = (
-            CONSTANTS["SH_OFFSET"] / CONSTANTS["SH_C0"] + scene.parameters["sh_dc"].detach()[len(scene) - n + body, 0]
-        )
+        own = scene.parameters["sh_dc"].detach()[len(scene) - n + body, 0]
+        colors = CONSTANTS["SH_OFFSET"] / CONSTANTS["SH_C0"] + own
         shades[:, body] = (torch.from_numpy(factors)[..., None] - 1) * colors
     return first, count, shades
 

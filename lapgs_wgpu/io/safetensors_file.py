@@ -76,9 +76,7 @@ def unpack_tensors(file: BinaryIO, size: int, where: str) -> tuple[dict[str, Arr
     position = 0
     for ((begin, end), _, _), name in entries:  # before anything is read: they follow one another without a gap
         if begin != position:
-            raise InputError(
-                f"{where}: tensor {name[:80]!r} begins at byte {begin}, not at {position}; the file is damaged"
-            )
+            raise InputError(f"{where}: tensor {name[:80]!r} begins at byte {begin}, not {position}; it is damaged")
         position = end
     if position != rest:
         raise InputError(f"{where}: its tensors end at byte {position}, its data at {rest}; the file is damaged")

@@ -26,9 +26,7 @@ class Timing:
         for values in (self.times, self.moments):
             fits = values.shape == (self.times.size,) and values.dtype == np.float64
             if not (fits and ((values >= 0) & (values <= 1)).all() and (np.diff(values) >= 0).all()):
-                raise ValueError(
-                    "timing.times and timing.moments must be as many numbers from 0 to 1 that never descend"
-                )
+                raise ValueError("timing.times and .moments must be as many numbers from 0 to 1 that never descend")
         if not np.diff(self.times).all():
             raise ValueError("timing.times must be different")
 

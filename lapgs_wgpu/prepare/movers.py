@@ -156,13 +156,13 @@ class Judged(NamedTuple):
 
 def judge(motion: Motion, model: Any) -> Judged:
     """model: a pycolmap.Reconstruction of some of the flow's images."""
-    images, number = [model.image(i) for i in model.reg_image_ids()], motion.names.index
-    poses = {number(image.name): np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for image in images}
+    images = {motion.names.index(model.image(i).name): model.image(i) for i in model.reg_image_ids()}
+    poses = {i: np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for i, image in images.items()}
     points = np.stack([point.xyz for point in model.points3D.values()])
     stride = max(1, len(motion.names) // 20)
     depths = [points @ pose[2, :3] + pose[2, 3] for i, pose in poses.items() if i % stride == 0]
     nearest = float(np.median([np.percentile(depth[depth > 0], 5) for depth in depths if (depth > 0).any()] or [1.0]))
-    camera = images[0].camera
+    camera = next(iter(images.values())).camera
     scale = camera.width / motion.images[0].shape[1]
     focal = camera.mean_focal_length() / scale
 
@@ -172,7 +172,7 @@ def judge(motion: Motion, model: Any) -> Judged:
         return np.where(np.isfinite(at.reshape(-1, 2)), seen, np.nan)
 
     def misses(i: int, noise_apart: NDArray[np.floating]) -> tuple[Floats, dict[int, Floats]]:
-        """Of the grid (rows columns,), in times the noise; by offset, in pixels."""
+        """Of the grid (rows columns,), and by offset, both in times the noise."""
         tracks = {k: at for k, at in motion.tracks[i].items() if i + k in poses}
         if i not in poses or len(tracks) < FEWEST:
             return np.full(motion.grid[..., 0].size, np.nan), {}
@@ -181,7 +181,7 @@ def judge(motion: Motion, model: Any) -> Judged:
         sigma = np.array([noise_apart[abs(k)] for k in tracks]) / focal
         # Nothing is nearer than half as far as the nearest points of the scene.
         total, each = depth_errors(directions(motion.grid), seen, relative, sigma, 2 / nearest)
-        return total, dict(zip(tracks, each * sigma[:, None] * focal, strict=True))
+        return total, dict(zip(tracks, each, strict=True))
 
     noise = NOISE + NOISE_GROWS * np.arange(REACH + 1)
     sampled = [misses(i, noise)[1] for i in range(0, len(motion.names), max(1, len(motion.names) // 12))]
@@ -189,7 +189,7 @@ def judge(motion: Motion, model: Any) -> Judged:
         found = [error[np.isfinite(error)] for each in sampled for k, error in each.items() if abs(k) == apart]
         if sum(map(len, found)):
             quarter = np.percentile(np.concatenate(found), 25)
-            noise[apart] = max(noise[apart], 1.55 * quarter)  # the median, if all were noise
+            noise[apart] *= max(1.0, 1.55 * quarter)  # the median, if all were noise
     planes = np.stack([misses(i, noise)[0] for i in range(len(motion.names))], dtype=np.float32)
     planes = planes.reshape(-1, *motion.grid.shape[:2])
     votes = _votes(motion, planes)

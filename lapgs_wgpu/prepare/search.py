@@ -65,9 +65,7 @@ def search(source: Reconstruction, *, rival: bool = False) -> Found | None:
         if found is not None:
             wrong = f"{found.error:.2f} pixels off, {found.faults} faults of the path"
             say(f"{len(found.placed)} of {count} cameras placed, {wrong}")
-            best = max(
-                best or found, found, key=lambda one: (round(20 * len(one.placed) / count), -one.faults, -one.error)
-            )
+            best = max(best or found, found, key=lambda it: (round(20 * len(it.placed) / count), -it.faults, -it.error))
         if best is not None and len(best.placed) >= GOOD * count:
             good = not best.faults and best.error < max(1.0, SHARP * max(source.size))
             if rival or (number and good):

@@ -17,7 +17,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.radix_sort import radix_sort
 from lapgs_wgpu.gpu.scan import scan
-from lapgs_wgpu.splat.buffer_plan import BufferPlan, BufferPlans, roomy
+from lapgs_wgpu.splat.buffer_plan import BufferPlans, roomy
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.constants import SPLAT_FLOATS
 from lapgs_wgpu.splat.drawing import Drawing, GaussianGradients, sh_defines
@@ -97,17 +97,11 @@ class Rasterizer:
         image = pool.array("image", (5 if depth else 4, camera.height, camera.width))
         splats = pool.array("splats", (len(gaussians), SPLAT_FLOATS))
         needed = [pool.array(f"needed {band}", (3,), "uint32") for band in range(plan.bands)]
-        shown = gaussians, camera, background, depth
-        drawing = Drawing(*shown, plan, self._drawings, image, splats, needed, move)
+        drawing = Drawing(gaussians, camera, background, depth, plan, self._drawings, image, splats, needed, move)
         for band in range(plan.bands):
             self._draw_band(commands, drawing, band)
             commands.flush()
         return drawing
-
-    def plan_of(self, camera: Camera) -> BufferPlan:
-        """The plan by which `record` draws this camera's image next."""
-        self.plans.turn_to((camera.width, camera.height, True))
-        return self.plans.now
 
     def holds(self, drawing: Drawing) -> bool:
         """Return whether the arrays still hold this drawing: no other image was drawn since."""
@@ -304,5 +298,5 @@ class Rasterizer:
         for number in range(plan.rounds):
             if plan.rounds > 1:
                 arrays["piece"] = self.pool.constant(kernel.uniform("Piece", number=number, state=tails))
-            commands.run(kernel, arrays["ranges"].shape[0] - 1, arrays)  # a tile each
+            commands.run(kernel, self._band_tiles(drawing, band), arrays)
         commands.run(gather, _groups(len(drawing.gaussians)), arrays)

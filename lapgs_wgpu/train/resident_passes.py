@@ -111,10 +111,11 @@ class ResidentPasses:
         self.parameters.begin(task.rates, moving=task.scheduled.moving)
         held = self._losses.held(truth)
         commands.copy(truth, held)
-        camera = task.view.camera
+        camera, plans = task.view.camera, self.rasterizer.plans
+        plans.turn_to((camera.width, camera.height, True))
         shape = (
             *(task.scheduled.moving, task.scheduled.seen, task.near.count > 0, task.even.count > 0, task.sh_degree),
-            *(camera.width, camera.height, self.rasterizer.plan_of(camera), len(self._scene)),
+            *(camera.width, camera.height, plans.now, len(self._scene)),
             self.corrections.moves_camera,
         )
         if self._device.textures:  # copies to them depend on what was done before

@@ -28,8 +28,8 @@ AROUND = 8  # images before and after one, whose median shift is the field's del
 class TimingRefinement:
     """How the timing of a scene is learnt: for the time of each image the time of the field that the image shows.
 
-    truth: the image of a view. picture: the scene's picture (H, W, 3) of a view under a timing, which is compared with
-    it. gap: the usual distance in time of two images of a camera.
+    truth: the image of a view. picture: the scene's picture (H, W, 3) of a view at a time of the field, which is
+    compared with it. gap: the usual distance in time of two images of a camera.
     """
 
     summary = (  # of `report`
@@ -42,7 +42,7 @@ class TimingRefinement:
         scene: Scene4D,
         views: Sequence[View],
         truth: Callable[[View], HostImage],
-        picture: Callable[[View, Timing], Tensor],
+        picture: Callable[[View, float], Tensor],
         gap: float,
     ) -> None:
         self._scene, self._truth, self._picture, self._gap = scene, truth, picture, gap
@@ -78,8 +78,7 @@ class TimingRefinement:
         """How much later the field time is that fits a view best, in gaps between images; and the share of the view's
         squared error that goes with a shift by one gap, as the square of the shift."""
         before, after = max(now - LARGEST_SHIFT * self._gap, 0.0), min(now + LARGEST_SHIFT * self._gap, 1.0)
-        times = np.array([view.time])
-        first, middle, last = (self._picture(view, Timing(times, np.array([t]))).double() for t in (before, now, after))
+        first, middle, last = (self._picture(view, t).double() for t in (before, now, after))
         truth, left_out = self._truth(view)
         counts = ~left_out[..., 0]
         error = (middle - truth.double())[counts].flatten()

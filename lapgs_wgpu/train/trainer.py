@@ -15,7 +15,7 @@ from lapgs_wgpu.errors import NumericalError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView, captured_arc
 from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.motion.timing import Timing
+from lapgs_wgpu.motion.timing import EVEN, Timing
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.train.camera_refinement import CameraRefinement
 from lapgs_wgpu.train.config import Config
@@ -153,10 +153,6 @@ class Trainer:
         seen = [dataclasses.replace(view, camera=self._learners.camera(view)) for view in chosen]
         return evaluate(self.scene, seen, self.config.data.background)
 
-    def psnr(self, views: Sequence[View]) -> float:
-        """The mean over views of the PSNR, dB, as `evaluate` measures it."""
-        return float(self.evaluate(views)["psnr"])
-
     @property
     def initial_view(self) -> InitialView:
         """Where a viewer begins."""
@@ -236,11 +232,12 @@ class Trainer:
         self.done = self.done if settled is None else settled
 
     @torch.no_grad()
-    def _picture(self, view: View, timing: Timing) -> Tensor:
-        """The scene's picture (H, W, 3) of a training view, with the corrections of its camera and of its colors."""
+    def _picture(self, view: View, t: float) -> Tensor:
+        """The scene's picture (H, W, 3) of a training view at a time of the field, with the corrections of its camera
+        and of its colors."""
         camera, correction = self._learners.camera(view), self.exposure_of(view)
         background = self._truth.backgrounds[view]
-        image = self.scene.render(camera, view.time, background, depth=False, timing=timing).image
+        image = self.scene.render(camera, t, background, depth=False, timing=EVEN).image
         return image if correction is None else image @ correction[:, :3].T + correction[:, 3]
 
     # The state between two steps -------------------------------------------------------------------------------------

@@ -45,9 +45,7 @@ class PlaneConfig(Options):
     features: int = option("features per plane and level", 32, at_least=1, at_most=256)
     space: int = option("resolution of the coarsest planes along each spatial axis", 64, at_least=2, at_most=4096)
     time: int = option("resolution along the time axis", 75, at_least=2, at_most=4096)
-    levels: int = option(
-        "number of levels; each doubles the spatial resolution of the one before", 2, at_least=1, at_most=6
-    )
+    levels: int = option("levels; each doubles the spatial resolution of the one before", 2, at_least=1, at_most=6)
 
 
 @dataclass(frozen=True)
