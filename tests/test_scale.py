@@ -149,7 +149,7 @@ NONE_BORN = {"density__max_world_size": "0", "density__gradient": "1"}
 @pytest.mark.nightly
 def test_a_training_that_loses_all_gaussians_says_so(dataset: Dataset, device: Device, tmp_path: Path) -> None:
     changes = {**NONE_BORN, "density__max_world_size": "1e-6"}
-    with pytest.raises(InputError, match=r"no Gaussian at step 30; raise density\.max_world_size"):
+    with pytest.raises(InputError, match=r"no Gaussian is left at step 30; raise density\.max_world_size"):
         train(configure(**changes), dataset, tmp_path / "run", device=device)
 
 
