@@ -40,10 +40,10 @@ def row(name: str, amount: float, seed: int, *, refine: bool) -> str:
         given, refinement = data.cameras, training.cameras
         found = given if refinement is None else [refinement.refined(camera) for camera in given]
         turn, shift = (float(np.median(errors)) for errors in pose_errors(found, true))
-        psnr, aligned = training.evaluate()["psnr"], ""
+        psnr, aligned = training.psnr(data.test), ""
         if refine:
             near = [aligned_view(training.scene, view, torch.zeros(3), data.extent) for view in data.test]
-            aligned = format(training.evaluate(near)["psnr"], ".2f")
+            aligned = f"{training.psnr(near):.2f}"
     return f"| {name} | {seed} | {turn:.2f} | {shift:.2f} | {psnr:.2f} | {aligned} |"
 
 

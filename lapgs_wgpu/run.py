@@ -185,7 +185,7 @@ def _steps(training: Trainer, out: Path, log: Log, interrupted: threading.Event)
             log.step(result, len(training.scene))
             if eval_interval and result.step % eval_interval == 0:
                 start = time.perf_counter()
-                log.evaluated(result.step, training.evaluate(views)["psnr"], name, time.perf_counter() - start)
+                log.evaluated(result.step, training.psnr(views), name, time.perf_counter() - start)
             if save_interval and result.step % save_interval == 0 and result.step < last:
                 run_folder.save_state(out, training.state())
             yield result

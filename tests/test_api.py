@@ -238,7 +238,7 @@ class Rows(nn.Module):
     [
         (lambda n: torch.zeros(n, 4), r"Rows must return translation as a Tensor \(300, 3\), got \(300, 4\)"),
         (lambda n: Deformation(orientation=torch.zeros(n, 3)), r"orientation as a Tensor \(300, 4\), got \(300, 3\)"),
-        (lambda n: None, "must return a Tensor or a Deformation, got NoneType"),
+        (lambda n: None, "must return a Tensor or Deformation, got NoneType"),
     ],
 )
 def test_results_of_another_form_are_named(value: Any, message: str, dataset: Dataset, device: Device) -> None:

@@ -142,17 +142,19 @@ def test_steps_are_those_of_torch(device: Device, dataset: Dataset, data: Path, 
     given = {"points__count": "150", "smoothness__share": "0", "acceleration__weight": "0", **KINDS.get(kind, {})}
     config = configure("static" if kind == "static" else "laplacian", data__path=str(data), **given)
     trainers = [started(config, dataset, device, step) for step in ("resident", "exchange")]
-    results = [[trainer.step() for _ in range(20)] for trainer in trainers]
+    results = [[trainer.step() for _ in range(10)] for trainer in trainers]
+    if kind == "corrections":  # before density control, whose ties may fall another way
+        mine, other = (trainer._learners.state() for trainer in trainers)
+        assert relative(mine["cameras"]["learnt"], other["cameras"]["learnt"]) < 0.1
+        exposures = [part["exposure"]["values"].detach() - torch.eye(3, 4) for part in (mine, other)]
+        assert relative(*exposures) < 0.1
+    for trainer, steps in zip(trainers, results, strict=True):
+        steps.extend(trainer.step() for _ in range(10))
     for mine, other in zip(*results, strict=True):
         assert mine.loss == pytest.approx(other.loss, rel=5e-2 if mine.step > 10 else 1e-4), mine.step
         assert mine.terms.keys() == other.terms.keys()
     counts = [len(trainer.scene) for trainer in trainers]
     assert counts[0] == pytest.approx(counts[1], rel=0.1)
-    if kind == "corrections":
-        mine, other = (trainer._learners.state() for trainer in trainers)
-        assert relative(mine["cameras"]["learnt"], other["cameras"]["learnt"]) < 0.1
-        exposures = [part["exposure"]["values"].detach() - torch.eye(3, 4) for part in (mine, other)]
-        assert relative(*exposures) < 0.1
 
 
 def test_a_resumed_training_and_one_that_was_looked_at_end_with_the_same_bytes(

@@ -62,9 +62,7 @@ def read_checkpoint(path: PathLike) -> Checkpoint:
             )
         version, size = int(declared[1]), int(declared[2])
         if version != VERSION:
-            raise InputError(
-                f"{where} has version {version}, and this program reads {VERSION}; use the one that wrote it"
-            )
+            raise InputError(f"{where} has version {version}; this program reads {VERSION}: use the one that wrote it")
         if not 0 <= 4 * element.count - size < 4:
             raise InputError(f"{where} declares {size} bytes in {element.count} words of 4 bytes; the file is damaged")
         ply.file.seek(element.offset)

@@ -153,6 +153,10 @@ class Trainer:
         seen = [dataclasses.replace(view, camera=self._learners.camera(view)) for view in chosen]
         return evaluate(self.scene, seen, self.config.data.background)
 
+    def psnr(self, views: Sequence[View]) -> float:
+        """The mean over views of the PSNR, dB, as `evaluate` measures it."""
+        return float(self.evaluate(views)["psnr"])
+
     @property
     def initial_view(self) -> InitialView:
         """Where a viewer begins."""

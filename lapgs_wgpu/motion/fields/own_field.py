@@ -50,9 +50,7 @@ class OwnField(Field):
         if isinstance(move, Tensor):
             move = Deformation(translation=move)
         if not isinstance(move, Deformation):
-            raise InputError(
-                f"the field {self._name} must return a Tensor or a Deformation, got {type(move).__name__}."
-            )
+            raise InputError(f"the field {self._name} must return a Tensor or Deformation, got {type(move).__name__}.")
         for part, row in _ROWS.items():
             values, wanted = getattr(move, part), (len(means), *row)
             if values is not None and (not isinstance(values, Tensor) or values.shape != wanted):
