@@ -78,11 +78,11 @@ def test_moments_are_those_of_one_still_camera() -> None:
         for t in range(10)
     ]
     still = Dataset("rig", tuple(views), ())
-    assert (still.still_cameras, len(still.times), still.moments) == (True, 20, 10)
+    assert (still.still_cameras, len(still.times), still.time_count) == (True, 20, 10)
     assert still.time_gap == pytest.approx(1 / 9)
     walking = tuple(dataclasses.replace(view, camera=dataclasses.replace(CAMERA)) for view in views)
     moving = Dataset("walk", walking, ())
-    assert (moving.still_cameras, moving.moments) == (False, 20)
+    assert (moving.still_cameras, moving.time_count) == (False, 20)
     assert moving.time_gap == pytest.approx(0.05)
 
 

@@ -73,16 +73,15 @@ def load_dataset(
     views = _views(frames, shrunk_size(frames[0].image.size, image_size), shared=capture.shares_cameras)
     training = [view for view, frame in zip(views, frames, strict=True) if frame.split == "train"]
     cameras = list(dict.fromkeys(view.camera for view in training))
-    cloud, moving = capture.cloud, None
+    cloud, cube = capture.cloud, None
     if cloud is not None:
         if capture.own_footage:
             named = {view.camera: frame.name.file for view, frame in zip(views, frames, strict=True)}
             warnings += check_views(cloud, named, capture.source)
         cloud = usable_cloud(cloud, cameras, capture.source, warnings)
-        if movers is not None:
-            moving = mover_cube(cloud, training)
+        cube = mover_cube(cloud, training)
     capture = dataclasses.replace(capture, frames=frames, cloud=cloud)
-    fit, cloud, depths = place(capture, cameras, moving, warnings)
+    fit, cloud, depths = place(capture, cameras, cube, warnings)
     whole = fit if fit is None or capture.moved is None else capture.moved.then(fit)
     # Without a cloud, what stands just before one camera would explain its images alone, and block those beside it.
     near = NEAR_SHARE * depths[0] if depths is not None and cloud is None else 0.0
@@ -113,7 +112,7 @@ def load_dataset(
     )
 
 
-def _summary(layout: str, capture: Capture, cameras: int, time_source: str, moved: Normalization | None) -> str:
+def _summary(layout: str, capture: Capture, cameras: int, time_source: str, whole: Normalization | None) -> str:
     """Say how a capture was understood: layout, cameras, times and their source, what is held out, its scale."""
     frames = capture.frames
     still = len(frames) >= 2 * cameras
@@ -124,7 +123,7 @@ def _summary(layout: str, capture: Capture, cameras: int, time_source: str, move
     trained = {frame.name.camera for frame in frames if frame.split == "train"}
     whole_camera = len({*held}) == 1 and held[0] not in trained
     held_out = f"{held[0]} is" if whole_camera else f"{len(held)} of {len(frames)} images are"
-    scale = "coordinates are kept" if moved is None else f"1 unit of the files becomes {moved.scale:.4g}"
+    scale = "coordinates are kept" if whole is None else f"1 unit of the files becomes {whole.scale:.4g}"
     left_out = f"; {capture.left_out} left out" if capture.left_out else ""
     return f"{layout}, {cameras_text}, {times} times from {time_source}; {held_out} held out; {scale}{left_out}"
 
@@ -205,24 +204,24 @@ def _views(frames: Sequence[Frame], size: Size, *, shared: bool) -> list[View]:
     """
     stored = frames[0].image.size
     undistortions: dict[Lens, Undistortion] = {}
-    cameras: dict[tuple[Lens, bytes] | int, Camera] = {}
+    cameras: dict[tuple[Lens, bytes], Camera] = {}
     views = []
-    for index, frame in enumerate(frames):
+    for frame in frames:
         assert frame.time is not None
         lens = frame.lens
         if lens not in undistortions:
             resized = lens.resized(*stored)
             undistortions[lens] = Undistortion(resized, resized.pinhole(frame.where))
         undistortion = undistortions[lens]
-        key = (lens, frame.T_cam_world.tobytes()) if shared else index
-        if key not in cameras:
-            K, taken = (lens.K, lens.size) if lens.is_pinhole else (undistortion.K, stored)
-            cameras[key] = Camera(K, frame.T_cam_world, *taken).resized(*size)
+        K, taken = (lens.K, lens.size) if lens.is_pinhole else (undistortion.K, stored)
+        camera = Camera(K, frame.T_cam_world, *taken).resized(*size)
+        if shared:
+            camera = cameras.setdefault((lens, frame.T_cam_world.tobytes()), camera)
         load = partial(_pixels, frame.image, undistortion, size)
         mask = partial(read_mask, undistortion=undistortion, size=size)
         ignored = partial(mask, frame.mask, frame.mask_kind) if frame.mask and frame.split == "train" else None
         moving = partial(mask, frame.moving, "white", above=MOSTLY) if frame.moving else None
-        views.append(View("", cameras[key], frame.time, str(frame.image), load, ignored, moving))
+        views.append(View("", camera, frame.time, str(frame.image), load, ignored, moving))
     return views
 
 

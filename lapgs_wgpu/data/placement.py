@@ -30,16 +30,16 @@ ROOM = 1.1  # of the cube, relative to what moves
 
 
 def place(
-    capture: Capture, cameras: Sequence[Camera], moving: Cube | None, warnings: list[str]
+    capture: Capture, cameras: Sequence[Camera], cube: Cube | None, warnings: list[str]
 ) -> tuple[Normalization | None, Cloud | None, tuple[float, float] | None]:
     """Determine the cube that a capture fills. Returns the transform to the world's coordinates, None where the
     capture's are kept, and cloud and depths in the world's.
 
-    cameras: the distinct training cameras, in the capture's coordinates. moving: the cube of what moves, in these, too;
+    cameras: the distinct training cameras, in the capture's coordinates. cube: that of what moves, in these, too;
     None for that of the whole scene. Appends warnings. Raises InputError where nothing tells where the scene is.
     """
     depths = _depths(capture, cameras, warnings)
-    cube = moving or _cube(capture, cameras, depths)
+    cube = cube or _cube(capture, cameras, depths)
     if cube is None:
         warnings.append(
             f"{capture.source}: half or more of {len(cameras)} cameras look away from the point nearest to all "

@@ -127,7 +127,7 @@ class Dataset:
         return bool(np.linalg.norm(directions(self.cameras, self.focus).mean(axis=0)) < ONE_SIDED)
 
     @cached_property
-    def moments(self) -> int:
+    def time_count(self) -> int:
         """The number of times; of a few still cameras, which may not be in step, the most images of one of them."""
         most = max(Counter(view.camera for view in self.train).values())
         return most if len(self.cameras) <= most else len(self.times)
@@ -135,7 +135,7 @@ class Dataset:
     @property
     def time_gap(self) -> float:
         """The usual distance in time from one moment to the next."""
-        return time_step(self.times) if self.moments == len(self.times) else 1 / (self.moments - 1)
+        return time_step(self.times) if self.time_count == len(self.times) else 1 / (self.time_count - 1)
 
     @cached_property
     def times(self) -> NDArray[np.float64]:

@@ -56,23 +56,8 @@ def cutout_tracks(
     residuals: images in the order of their times, whose masks say what moves. depths: (H, W) of what stands still in
     each, world units, NaN where unknown. half_side: of the box that the field covers, world units.
     """
-    levels = [_levels(each) for each in residuals]
     masks = np.stack([each.mask for each in residuals])
-    rest, least = masks.copy(), LEAST * masks[0].size
-    cutouts: list[_Cutout] = []
-    sizes = masks.sum(axis=(1, 2))
-    enough, searched = np.maximum(ENOUGH * sizes, least), np.zeros(len(masks), bool)
-    while len(cutouts) < MOST and (sizes > enough).any():
-        key = int(np.argmax(sizes))
-        labels, count = ndimage.label(ndimage.binary_opening(masks[key]))
-        for label in range(1, count + 1):
-            part = labels == label
-            if (part & rest[key]).sum() > max(ENOUGH * part.sum(), least):
-                rows, columns = np.nonzero(part)
-                cutouts.append(_followed(levels, masks, key, np.stack([columns, rows], axis=1)))
-                rest &= ~cutouts[-1].explained
-        searched[key] = True
-        sizes = np.where(searched, 0, rest.sum(axis=(1, 2)))
+    cutouts, rest = _cutouts([_levels(each) for each in residuals], masks)
     if not cutouts:
         return None, 0.0
     ground = [_depths(mask, depth) for mask, depth in zip(masks, depths, strict=True)]
@@ -92,6 +77,26 @@ def cutout_tracks(
     positions = (paths - way[:, None])[keys[number], np.arange(len(number))]
     positions += half_side * apart[number][:, None] * ahead - positions.mean(axis=0)
     return Tracks(positions, colors, number, paths, seen[:, number]), float((masks & ~rest).sum() / masks.sum())
+
+
+def _cutouts(levels: Sequence[list[Floats]], masks: Mask) -> tuple[list[_Cutout], Mask]:
+    """Cut out what moves where most of it is left, image by image; and what then is left of the masks (T, H, W)."""
+    rest, least = masks.copy(), LEAST * masks[0].size
+    cutouts: list[_Cutout] = []
+    sizes = masks.sum(axis=(1, 2))
+    enough, searched = np.maximum(ENOUGH * sizes, least), np.zeros(len(masks), bool)
+    while len(cutouts) < MOST and (sizes > enough).any():
+        key = int(np.argmax(sizes))
+        labels, count = ndimage.label(ndimage.binary_opening(masks[key]))
+        for label in range(1, count + 1):
+            part = labels == label
+            if (part & rest[key]).sum() > max(ENOUGH * part.sum(), least):
+                rows, columns = np.nonzero(part)
+                cutouts.append(_followed(levels, masks, key, np.stack([columns, rows], axis=1)))
+                rest &= ~cutouts[-1].explained
+        searched[key] = True
+        sizes = np.where(searched, 0, rest.sum(axis=(1, 2)))
+    return cutouts, rest
 
 
 def _show_nearest(cutouts: Sequence[_Cutout], seen: Mask) -> None:

@@ -56,11 +56,7 @@ NEAR = 0.1  # box half sides; distance within which a track explains a surface p
 
 
 def start_training(
-    config: Config,
-    dataset: Dataset | None = None,
-    device: Device | None = None,
-    *,
-    parts: Parts | None = None,
+    config: Config, dataset: Dataset | None = None, device: Device | None = None, *, parts: Parts | None = None
 ) -> Trainer:
     """Do motion discovery as the configuration says, and make the trainer that starts from what it finds.
 
@@ -111,6 +107,8 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
     generator = torch.Generator().manual_seed(config.seed)
     found = _in_hull(config, dataset, device) if dataset.is_surrounded else None
     found = found or _in_residuals(config, dataset, device, generator)
+    if found.share < config.discovery.least:
+        found = found._replace(tracks=None)
     scene = _scene_with(found, config, generator, own_field)
     field_fitted, summary = 0.0, f"{found.share:.1%} of what it lacks can be followed: nothing is added"
     if (tracks := found.tracks) is not None:
@@ -185,7 +183,6 @@ def _in_residuals(config: Config, dataset: Dataset, device: Device, generator: t
         tracks, share = cutout_tracks(images, depths, half_side)
         meter.clear()
         times = np.array([image.time for image in images])
-        tracks = tracks if share >= config.discovery.least else None
         return _Found(static, tracks, times, share, "a static fit", {}, sheets=True, corrections=corrections)
     clouds = surface_points(images, half_side)
     times, tracks, light = clouds.times, find_tracks(clouds), dict[int, Floats]()
@@ -193,9 +190,7 @@ def _in_residuals(config: Config, dataset: Dataset, device: Device, generator: t
         together = 2 * len(dataset.times) <= len(dataset.train)
         tracks = tracks_in_images(tracks, times, images, static, background, together=together)
     share = explained_share(clouds, tracks)
-    if share < config.discovery.least:
-        tracks = None
-    elif tracks is not None:
+    if tracks is not None and share >= config.discovery.least:
         stands, turns = find_turns(tracks, times, images)
         if turns:
             tracks, light = rigid_tracks(tracks, stands, turns, times, images, device, generator)

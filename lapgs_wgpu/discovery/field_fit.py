@@ -56,12 +56,11 @@ def fit_field(
         return None
     if fades and isinstance(field, GridField) and field.config.dynamics_size > 1 and field.config.temporal_hash:
         _tell_times(field, generator)
-    optimizer = torch.optim.Adam([{"params": each, "lr": rate} for rate, each in groups], eps=ADAM_EPS, fused=True)
+    optimizer = torch.optim.Adam([{"params": each, "rate": rate} for rate, each in groups], eps=ADAM_EPS, fused=True)
     paths, supported = torch.from_numpy(tracks.paths), torch.from_numpy(tracks.supported)
     beside = torch.from_numpy(ndimage.maximum_filter1d(tracks.supported, 3, axis=0)).float()
     canonical, codes = scene.parameters["means"].detach(), scene.parameters.get("dynamics")
     first, count, shades = _bodies(scene, tracks, light)
-    asked = torch.arange(len(tracks.part))
     order: list[int] = []
     errors: list[float] = []
     at_once, most = (8, MOVING // 2) if fades else (1, MOVING)  # times that a step looks at, and Gaussians
@@ -70,13 +69,7 @@ def fit_field(
             order = torch.randperm(len(times), generator=generator).tolist() + order
         now = [order.pop() for _ in range(at_once)]
         staying = torch.randint(max(still, 1), (min(still, STILL),), generator=generator)
-        if len(tracks.part) > most:
-            asked = torch.randint(len(tracks.part), (most,), generator=generator)
-        other, way = asked, torch.zeros(len(asked), 1)
-        if light:
-            along, way = torch.rand(2, len(asked), 1, generator=generator)
-            other = first[asked] + (along[:, 0] * count[asked]).long()
-            way = way * (WITHIN + BEYOND) - BEYOND
+        asked, other, way = _asked(first, count, most, generator, within=bool(light))
         means = torch.cat([canonical[still + asked].lerp(canonical[still + other], way), canonical[staying]])
         dynamics = None if codes is None else codes.detach()[torch.cat([still + asked, staying])]
         loss, distance = torch.zeros(()), 0.0
@@ -94,8 +87,8 @@ def fit_field(
             distance += float((seen * squared[: len(asked)].detach().sqrt()).sum() / seen.sum().clamp(min=1))
         if not loss.requires_grad:
             return None
-        for group, (rate, _) in zip(optimizer.param_groups, groups, strict=True):
-            group["lr"] = rate * max(LAST, min(1.0, 2.0 * (steps - step) / steps))
+        for group in optimizer.param_groups:
+            group["lr"] = group["rate"] * max(LAST, min(1.0, 2.0 * (steps - step) / steps))
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -103,6 +96,18 @@ def fit_field(
         progress(step + 1)
     optimizer.zero_grad()
     return float(np.mean(errors[-max(1, steps // 10) :]))
+
+
+def _asked(
+    first: Tensor, count: Tensor, most: int, generator: torch.Generator, *, within: bool
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The points of tracks (n,) that a step asks, at most so many; within: on the way from each to another point of its
+    body (n,), at a share of it (n, 1). first, count: of `_bodies`."""
+    asked = torch.randint(len(first), (most,), generator=generator) if len(first) > most else torch.arange(len(first))
+    if not within:
+        return asked, asked, torch.zeros(len(asked), 1)
+    along, way = torch.rand(2, len(asked), 1, generator=generator)
+    return asked, first[asked] + (along[:, 0] * count[asked]).long(), way * (WITHIN + BEYOND) - BEYOND
 
 
 def _groups(field: Field, *, look: bool) -> list[tuple[float, list[nn.Parameter]]]:

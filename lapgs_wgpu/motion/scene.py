@@ -61,7 +61,7 @@ class Scene4D:
     Attributes:
         field_config: configuration of the field.
         on_access: called with "gaussians" or "field" before these are given out: a device may have newer ones.
-        on_device: gives the Gaussians at a time of the field, where a training keeps newer ones there; else None.
+        newest_at: gives the Gaussians at a time of the field, where a training keeps newer ones there; else None.
         device: that renders.
         sh_degree: degree of the harmonics in use, 0 to 3.
         antialiased: how the Gaussians are drawn, see Gaussians.
@@ -87,7 +87,7 @@ class Scene4D:
         """
         check_own(field_config, own_field)
         self.on_access: Callable[[str], None] = lambda part: None
-        self.on_device: Callable[[float], Gaussians[Tensor]] | None = None
+        self.newest_at: Callable[[float], Gaussians[Tensor]] | None = None
         self._parameters = {
             name: nn.Parameter(parameters[name].detach().float().contiguous().clone())
             for name in row_shapes(field_config)
@@ -167,13 +167,13 @@ class Scene4D:
 
         timing: takes the place of the scene's; with EVEN, t is the field's own time.
         """
-        t = (timing or self.timing)(t)
-        if self.on_device is not None and not torch.is_grad_enabled():
-            return self.on_device(t)
-        return self.deformed(t).gaussians
+        field_time = (timing or self.timing)(t)
+        if self.newest_at is not None and not torch.is_grad_enabled():
+            return self.newest_at(field_time)
+        return self.deformed(field_time).gaussians
 
-    def deformed(self, t: float, nearby: Nearby | None = None, time_samples: TimeSamples | None = None) -> Deformed:
-        """The Gaussians at a time t of the field, activated, with what the losses of motion compare. Differentiable as
+    def deformed(self, time: float, nearby: Nearby | None = None, time_samples: TimeSamples | None = None) -> Deformed:
+        """The Gaussians at a time of the field, activated, with what the losses of motion compare. Differentiable as
         in `at`.
 
         nearby: where the smoothness loss looks; None without it. time_samples: some of the Gaussians and further times
@@ -182,8 +182,8 @@ class Scene4D:
         p = self.parameters
         canonical = self.canonical()
         if self.field is None or len(self) == 0:
-            return Deformed(canonical, None, [])
-        move, *others = self.field.at_times(p["means"], t, p.get("dynamics"), nearby, time_samples)
+            return Deformed(canonical)
+        move, *others = self.field.at_times(p["means"], time, p.get("dynamics"), nearby, time_samples)
         quats, sh, opacities = canonical.quats, canonical.sh, canonical.opacities
         if move.orientation is not None:
             quats = quat_multiply(move.orientation, quats)
@@ -196,7 +196,7 @@ class Scene4D:
         means, scales = self._moved(move, canonical.means, canonical.scales)
         gaussians = Gaussians(means, quats, scales, opacities, sh, antialiased=self.antialiased)
         if time_samples is None:
-            return Deformed(gaussians, move.smoothness, [])
+            return Deformed(gaussians, move.smoothness)
         rows = p["means"][time_samples.rows], canonical.scales[time_samples.rows]
         return Deformed(gaussians, move.smoothness, [self._moved(other, *rows) for other in others])
 

@@ -45,28 +45,26 @@ class Motion:
         cv2 = import_cv2()
         dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         dis.setFinestScale(1)
-        self.names = names
-        self.images: list[Pixels] = []
+        following = iter(frames)
+        self.names, self.images = names, [next(following)[0]]
+        height, width = self.images[0].shape[:2]
+        pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
+        before = cv2.cvtColor(self.images[0], cv2.COLOR_RGB2GRAY)
         flows: list[list[NDArray[np.float16]]] = []  # from each picture to the next one, and back
-        before: Any = None
         flow: list[Plane] = []  # forth and back, from the last picture on
         with Progress(len(names), "images followed") as progress:
-            for image, chosen in frames:
+            progress.at(1)
+            for image, chosen in following:
                 gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-                if before is not None:
-                    there, again = dis.calc(before, gray, None), dis.calc(gray, before, None)
-                    if flow:
-                        pixels = np.stack(np.meshgrid(*map(np.arange, gray.shape[::-1])), axis=-1).astype(np.float32)
-                        there, again = flow[0] + _at(there, pixels + flow[0]), again + _at(flow[1], pixels + again)
-                    flow = [there, again]
-                before = gray
+                there, again = dis.calc(before, gray, None), dis.calc(gray, before, None)
+                if flow:
+                    there, again = flow[0] + _at(there, pixels + flow[0]), again + _at(flow[1], pixels + again)
+                flow, before = [there, again], gray
                 if chosen:
-                    if self.images:
-                        flows.append([way.astype(np.float16) for way in flow])
+                    flows.append([way.astype(np.float16) for way in flow])
                     self.images.append(image)
                     flow = []
                     progress.at(len(self.images))
-        height, width = self.images[0].shape[:2]
         places = np.meshgrid(np.arange(STEP // 2, width, STEP), np.arange(STEP // 2, height, STEP))
         self.grid: Plane = np.stack(places, axis=-1).astype(np.float32)
         back = [flow[::-1] for flow in flows]
@@ -186,10 +184,9 @@ def judge(motion: Motion, model: Any) -> Judged:
     noise = NOISE + NOISE_GROWS * np.arange(REACH + 1)
     sampled = [misses(i, noise)[1] for i in range(0, len(motion.names), max(1, len(motion.names) // 12))]
     for apart in range(1, REACH + 1):
-        found = [error[np.isfinite(error)] for each in sampled for k, error in each.items() if abs(k) == apart]
-        if sum(map(len, found)):
-            quarter = np.percentile(np.concatenate(found), 25)
-            noise[apart] *= max(1.0, 1.55 * quarter)  # the median, if all were noise
+        errors = np.array([error for each in sampled for k, error in each.items() if abs(k) == apart])
+        if len(known := errors[np.isfinite(errors)]):
+            noise[apart] *= max(1.0, 1.55 * np.percentile(known, 25))  # the median, if all were noise
     planes = np.stack([misses(i, noise)[0] for i in range(len(motion.names))], dtype=np.float32)
     planes = planes.reshape(-1, *motion.grid.shape[:2])
     votes = _votes(motion, planes)

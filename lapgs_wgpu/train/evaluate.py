@@ -91,12 +91,7 @@ class Lpips:
 
 
 def evaluate(
-    scene: Scene4D,
-    views: Sequence[View],
-    background: str,
-    folder: Path | None = None,
-    *,
-    lpips: Lpips | None = None,
+    scene: Scene4D, views: Sequence[View], background: str, folder: Path | None = None, *, lpips: Lpips | None = None
 ) -> dict[str, Any]:
     """Render every view and compare: the content of metrics.json (docs/metrics.md).
 

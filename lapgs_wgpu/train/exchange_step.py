@@ -135,7 +135,7 @@ class ExchangeStep:
 
     def __init__(self, learners: Learners, density: DensityControl, draws: Draws) -> None:
         self._learners, self._density, self._draws = learners, density, draws
-        self._config, self._scene, self._time_count = learners.config, learners.scene, learners.dataset.moments
+        self._config, self._scene, self._time_count = learners.config, learners.scene, learners.dataset.time_count
 
     def take(self, scheduled: Scheduled, began: Callable[[], None]) -> Callable[[], Measured]:
         """Take a step; gives what it told.
@@ -183,7 +183,7 @@ class ExchangeStep:
         """Add the gradients of a view's loss, at a time of the field, to those of all that learns."""
         config, scene, moving = self._config, self._scene, scheduled.moving
         learners, truth = self._learners, self._draws.truth
-        now = scene.deformed(t, nearby, time_samples) if moving else Deformed(scene.canonical(), None, [])
+        now = scene.deformed(t, nearby, time_samples) if moving else Deformed(scene.canonical())
         weights = config.loss.weights(warm=moving)
         weighted = [(term, weight) for term in learners.parts.losses if (weight := term.weight_at(scheduled.step))]
         of_image = [(term, weight) for term, weight in weighted if not isinstance(term, Regularizer)]

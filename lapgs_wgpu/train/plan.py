@@ -69,12 +69,7 @@ def step_seconds(config: Config, dataset: Dataset, device: Device) -> float:
 
 
 def plan_training(
-    folder: Path,
-    opened: Dataset,
-    device: Device,
-    *,
-    minutes: float | None = None,
-    exposure: bool = False,
+    folder: Path, opened: Dataset, device: Device, *, minutes: float | None = None, exposure: bool = False
 ) -> Plan:
     """Choose the training of a capture: a small preset on a CPU device; on others a large one, where most of its
     schedule fits into the time. The steps are the schedule's, more for many times, fewer where the time is short.
@@ -101,7 +96,7 @@ def plan_training(
             continue
         limit = minutes or (math.inf if last else PATIENCE)
         whole = config.schedule.steps
-        steps = round(min(max(whole, STEPS_PER_TIME * dataset.moments), 60 * limit / (WHOLE * step)))
+        steps = round(min(max(whole, STEPS_PER_TIME * dataset.time_count), 60 * limit / (WHOLE * step)))
         if last or steps >= LEAST_SHARE * whole:
             break
     if steps < LEAST_STEPS:
@@ -112,7 +107,7 @@ def plan_training(
         )
     seconds = WHOLE * step * steps
     text = (
-        f"training: {preset} ({layout}, {len(dataset.train)} images of {dataset.moments} times), {steps} steps (its "
+        f"training: {preset} ({layout}, {len(dataset.train)} images of {dataset.time_count} times), {steps} steps (its "
         f"schedule has {whole}){', colors of each image corrected' if exposure else ''}. A step takes {1e3 * step:.0f} "
         f"ms on {device.info.name}: the training will take about {duration(seconds)}."
     )

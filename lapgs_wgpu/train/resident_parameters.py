@@ -4,7 +4,7 @@ Between two looks of the host the device has the newest values. Whoever reads to
 next step pushes what the host may have changed.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -145,12 +145,12 @@ class ResidentParameters:
         self.values_on_host, self.state_on_host = set(), set()
 
     @torch.no_grad()
-    def pull(self, *parts: str, state: bool) -> None:
-        """Make torch's tensors of some parts, of all if none is named, the newest ones. state: and the optimizers'."""
-        for part in set(parts or PARTS) - self.values_on_host:
+    def pull(self, parts: Sequence[str], *, state: bool) -> None:
+        """Make torch's tensors of these parts the newest ones. state: and the optimizers'."""
+        for part in set(parts) - self.values_on_host:
             self._read(part, "value", self._tensors[part])
             self.values_on_host.add(part)
-        for part in set(parts or PARTS) - self.state_on_host if state else ():
+        for part in set(parts) - self.state_on_host if state else ():
             tensors = self._tensors[part]
             adam = {name: {kind: torch.zeros_like(each) for kind in MOMENTS} for name, each in tensors.items()}
             for kind in MOMENTS:

@@ -10,7 +10,7 @@ from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.gpu.kernel import Commands, Kernel, Later, Recording
 from lapgs_wgpu.gpu.matmul import sum_columns
 from lapgs_wgpu.motion.fields.grid_field import GridField
-from lapgs_wgpu.motion.passes.activation_passes import ActivationPasses, Line
+from lapgs_wgpu.motion.passes.activation_passes import ActivationPasses
 from lapgs_wgpu.motion.passes.grid_field_passes import Decoding, FieldArrays, GridFieldPasses
 from lapgs_wgpu.motion.passes.samples import NO_SAMPLES, Samples
 from lapgs_wgpu.splat.drawing import Drawing, GaussianGradients
@@ -113,11 +113,9 @@ class ResidentPasses:
         commands.copy(truth, held)
         camera, plans = task.view.camera, self.rasterizer.plans
         plans.turn_to((camera.width, camera.height, True))
-        shape = (
-            *(task.scheduled.moving, task.scheduled.seen, task.near.count > 0, task.even.count > 0, task.sh_degree),
-            *(camera.width, camera.height, plans.now, len(self._scene)),
-            self.corrections.moves_camera,
-        )
+        # All that `_record` reads of the first step of a shape; the others replay what it recorded.
+        kind = task.scheduled.moving, task.scheduled.seen, task.near.count > 0, task.even.count > 0, task.sh_degree
+        shape = *kind, camera.width, camera.height, plans.now, len(self._scene), self.corrections.moves_camera
         if self._device.textures:  # copies to them depend on what was done before
             return self._record(commands, task, held)
         self._recordings = {key: each for key, each in self._recordings.items() if each.holds}
@@ -147,50 +145,49 @@ class ResidentPasses:
         d_image = self._losses.pool.array("d_image", (4, camera.height, camera.width))
         self.rasterizer.backward(self.rasterizer.draw_whole(drawn, camera, gradient=True), d_image)
 
-    def _record(self, commands: Commands, task: Task, truth: DeviceArray) -> Recorded:
+    def _record(self, commands: Commands, first: Task, truth: DeviceArray) -> Recorded:
         """Record what is replayed in later steps of this shape: what differs between them is read from self._task, in
-        functions that are called anew at each, never from `task`."""
+        functions that are called anew at each, never from `first`."""
         for array in (self._bad, self._totals):
             commands.clear(array)
         passes, field, corrections = self._activation, self._field, self.corrections
         smooth, even = self._config.smoothness, self._config.acceleration
         values, gradients = self.parameters.arrays("value"), self.parameters.arrays("gradient")
-        decodings = self._decode(commands, task, values)
+        decodings = self._decode(commands, first, values)
         now = decodings[0] if decodings else None
-        drawn = self._activate(commands, task.sh_degree, now)
-        drawing = self.rasterizer.record(commands, drawn, task.view.camera, self._background, corrections.move)
+        drawn = self._activate(commands, first.sh_degree, now)
+        drawing = self.rasterizer.record(commands, drawn, first.view.camera, self._background, corrections.move)
         image = corrections.expose(commands, drawing.image)
-        terms, d_image = self._losses.record(commands, image, truth, self._weights(task))
+        terms, d_image = self._losses.record(commands, image, truth, self._weights(first))
         d_image = corrections.expose_bwd(commands, drawing.image, d_image)
         by_drawn = self.rasterizer.record_bwd(commands, drawing, d_image, camera=corrections.moves_camera)
         corrections.sum_camera(commands, by_drawn.camera)
-        if task.even.count:
-            scale = even.weight * even.interval / task.even.count
-            line = Line(decodings[0], decodings[1], decodings[2], scale)
-            accelerations = passes.acceleration(commands, line, values, drawn, by_drawn, gradients)
-            self._total(commands, accelerations, "acceleration", line.scale)
+        if first.even.count:
+            scale = even.weight * even.interval / first.even.count
+            accelerations = passes.acceleration(commands, decodings, scale, values, drawn, by_drawn, gradients)
+            self._total(commands, accelerations, "acceleration", scale)
         passes.activate_bwd(commands, values, drawn, by_drawn, now, gradients)
         if field is not None and now is not None:
             for each in decodings:
                 field.decode_bwd(commands, each, values, gradients)
-            if task.near.count:
-                weights = [weight / task.near.count for weight in (smooth.static, smooth.temporal)]
+            if first.near.count:
+                weights = [weight / first.near.count for weight in (smooth.static, smooth.temporal)]
                 times = now.time, lambda: self._task.near_time
                 differences = field.compare(commands, values, gradients, lambda: self._task.near, times, weights)
                 for name, sums, weight in zip(TOTALS, differences, weights, strict=False):
                     self._total(commands, sums, name, weight)
             if self._dynamics_loss:
                 self._dynamics(commands, values.beside, gradients.beside)
-        self._record_end(commands, task, drawing, by_drawn, terms)
+        self._record_end(commands, first, drawing, by_drawn, terms)
         return drawing, [self.guard, self._bad, terms, self._totals, *drawing.needed]
 
-    def _decode(self, commands: Commands, task: Task, values: FieldArrays) -> list[Decoding]:
+    def _decode(self, commands: Commands, first: Task, values: FieldArrays) -> list[Decoding]:
         """Record the field at a step's time, and before and after it where the step has that."""
         field = self._field
-        if field is None or not task.scheduled.moving:
+        if field is None or not first.scheduled.moving:
             return []
         decodings = [field.decode(commands, 0, values, lambda: self._task.time)]
-        if task.even.count:
+        if first.even.count:
             for number, time in ((3, lambda: self._task.even_times[0]), (4, lambda: self._task.even_times[1])):
                 decodings.append(field.decode(commands, number, values, time, lambda: self._task.even))
         return decodings
@@ -218,7 +215,7 @@ class ResidentPasses:
         self._total(commands, arrays["losses"], "dynamics", 1.0)
 
     def _record_end(
-        self, commands: Commands, task: Task, drawing: Drawing, by_drawn: GaussianGradients, terms: DeviceArray
+        self, commands: Commands, first: Task, drawing: Drawing, by_drawn: GaussianGradients, terms: DeviceArray
     ) -> None:
         """Record whether the step may change anything, and what it changes."""
         count, guard = len(self._scene), self.guard
@@ -231,8 +228,8 @@ class ResidentPasses:
         )
         for needed in drawing.needed:
             commands.dispatch(close, 1, guarded=guarded, needed=needed, bad=self._bad, guard=guard)
-        if task.scheduled.seen:
-            kernel, camera = Kernel.get(self._device, "accumulate_statistics"), task.view.camera
+        if first.scheduled.seen:
+            kernel, camera = Kernel.get(self._device, "accumulate_statistics"), first.view.camera
             content = kernel.uniform("Seen", half_size=(camera.width / 2, camera.height / 2), gaussians=count)
             arrays = {"splats": drawing.splats, "d_splats": by_drawn.splats, "statistics": self.seen()}
             seen = self._pool.constant(content)

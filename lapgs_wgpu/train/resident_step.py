@@ -55,7 +55,7 @@ class ResidentStep:
         self.parameters = self._passes.parameters
         self._flying: deque[Task] = deque()
         self._ring: list[Any] = []
-        scene.on_access, scene.on_device = self.to_host, self.at
+        scene.on_access, scene.newest_at = self.to_host, self.at
         learners.optimizer.on_access = partial(self.to_host, state=True)
         learners.on_access = self.corrections_to_host
 
@@ -64,12 +64,13 @@ class ResidentStep:
     def to_host(self, *parts: str, state: bool = False) -> None:
         """Wait for all steps, and make the scene's tensors of some parts, of all if none is named, the newest ones.
         state: the optimizers' state of them, too."""
+        parts = parts or PARTS
         self.settle()
-        if "gaussians" in set(parts or PARTS) - self.parameters.values_on_host:
+        if "gaussians" in set(parts) - self.parameters.values_on_host:
             seen = torch.from_numpy(self._passes.seen().read())
             for target, column in zip(vars(self._density.statistics).values(), seen.T, strict=True):
                 target.copy_(column)
-        self.parameters.pull(*parts, state=state)
+        self.parameters.pull(parts, state=state)
 
     def corrections_to_host(self) -> None:
         """Wait for all steps, and make the host's corrections of cameras and colors the newest ones."""
@@ -104,7 +105,7 @@ class ResidentStep:
         return measured
 
     def _task(self, scheduled: Scheduled) -> Task:
-        learners, config, times = self._learners, self._learners.config, self._learners.dataset.moments
+        learners, config, times = self._learners, self._learners.config, self._learners.dataset.time_count
         generator, count = self._draws.generator, len(self._scene)
         before, view = self._draws.mark(), self._draws.next()
         rates = learners.optimizer.rates_at(scheduled.step, scheduled.share)
@@ -150,9 +151,9 @@ class ResidentStep:
         except Exception as error:
             self._flying.clear()
             undone = [task for task in tasks if task.measured is None]
-            for task in undone[:1]:
-                self._draws.go_back(task.before)
-                self._scene.sh_degree = task.sh_degree
+            if undone:
+                self._draws.go_back(undone[0].before)
+                self._scene.sh_degree = undone[0].sh_degree
             bad = isinstance(error, NumericalError) and len(undone) == len(tasks)  # else too many steps were skipped
             self._roll_back_to(None if bad else tasks[-1].scheduled.step - len(undone))
             raise

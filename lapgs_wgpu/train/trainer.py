@@ -163,7 +163,7 @@ class Trainer:
         data = self.dataset
         camera = (data.test or data.train)[0].camera
         arc = captured_arc(camera, data.cameras, data.focus, data.up)
-        return InitialView(camera, data.focus, data.up, data.moments, arc)
+        return InitialView(camera, data.focus, data.up, data.time_count, arc)
 
     def save(self, path: str | Path) -> None:
         """Write a checkpoint (docs/format.md) to `path`, which lapgs-view and `load` open. Raises InputError."""

@@ -5,6 +5,7 @@ units; the field gives them no gradient. t: in [0, 1]. dynamics: (N, D) or None.
 A new field is the identity. `OwnField` makes a field of any nn.Module.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -101,8 +102,8 @@ class Deformed(NamedTuple):
     """
 
     gaussians: Gaussians[Tensor]
-    smoothness: Tensor | None
-    at_times: list[tuple[Tensor, Tensor]]
+    smoothness: Tensor | None = None
+    at_times: Sequence[tuple[Tensor, Tensor]] = ()
 
 
 def linear(shape: tuple[int, ...], generator: torch.Generator | None = None) -> nn.Linear:

@@ -1,6 +1,6 @@
 """From the Gaussians as they are trained to those that are drawn at a time, on the device, and back."""
 
-from typing import NamedTuple
+from collections.abc import Sequence
 
 from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.gpu.device import Device
@@ -13,18 +13,6 @@ from lapgs_wgpu.splat.gaussians import Gaussians
 
 GEOMETRY_FLOATS = 12  # of a Gaussian, common/geometry.wgsl
 SH_FLOATS = 48
-
-
-class Line(NamedTuple):
-    """Samples before and after the time of a step, which should lie on a line with all Gaussians `now`.
-
-    scale: of the gradient: the loss's weight, divided by the number of samples.
-    """
-
-    now: Decoding
-    before: Decoding
-    after: Decoding
-    scale: float
 
 
 class ActivationPasses:
@@ -71,7 +59,8 @@ class ActivationPasses:
     def acceleration(
         self,
         commands: Commands,
-        line: Line,
+        decodings: Sequence[Decoding],
+        scale: float,
         values: FieldArrays,
         drawn: Gaussians[DeviceArray],
         by_drawn: GaussianGradients,
@@ -79,9 +68,11 @@ class ActivationPasses:
     ) -> DeviceArray:
         """Record the acceleration loss of each sample, without its weight: (count,).
 
-        Its gradients are added to those of the Gaussians; the outputs of both decodings become theirs.
+        decodings: of all Gaussians at the time of a step, and of samples before and after it, which should lie on a
+        line with these. scale: of the gradient: the loss's weight, divided by the number of samples. Its gradients are
+        added to those of the Gaussians; the outputs of both decodings become theirs.
         """
-        (now, before, after, scale), kernel = line, Kernel.get(self._device, "acceleration")
+        (now, before, after), kernel = decodings, Kernel.get(self._device, "acceleration")
         assert before.sampling is not None
 
         def write() -> bytes:
