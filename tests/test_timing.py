@@ -67,7 +67,7 @@ def test_a_scene_moves_by_its_timing_and_so_does_its_file(device: Device, tmp_pa
     expected = scene.at(0.3).means.detach()
     scene.timing = LATE
     assert torch.equal(scene.at(LATE.times[0] + 0.1).means, expected)  # whose moment is 0.3, too
-    assert torch.equal(scene.at(0.3, timing=EVEN).means, expected)
+    assert torch.equal(scene.at_field_time(0.3).means, expected)
     scene.timing = Timing(np.array([0.7]), np.array([0.3]))
     assert torch.equal(scene.at(0.7).means, expected)
     scene.save(tmp_path / "scene.ply")

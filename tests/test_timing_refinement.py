@@ -57,7 +57,7 @@ def views_at(times: Sequence[float]) -> list[View]:
 
 def refinement(scene: Scene4D, truth: Callable[[View], Tensor], times: Sequence[float] = TIMES) -> TimingRefinement:
     def picture(view: View, t: float) -> Tensor:
-        return scene.render(view.camera, t, timing=EVEN).image
+        return scene.render_at_field_time(view.camera, t).image
 
     def image(view: View) -> HostImage:
         pixels = truth(view)

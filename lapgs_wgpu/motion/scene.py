@@ -162,15 +162,15 @@ class Scene4D:
             antialiased=self.antialiased,
         )
 
-    def at(self, t: float, *, timing: Timing | None = None) -> Gaussians:
-        """The Gaussians at time t in [0, 1], activated. Differentiable in `parameters` and the field's parameters.
+    def at(self, t: float) -> Gaussians:
+        """The Gaussians at time t in [0, 1], activated. Differentiable in `parameters` and the field's parameters."""
+        return self.at_field_time(self.timing(t))
 
-        timing: takes the place of the scene's; with EVEN, t is the field's own time.
-        """
-        field_time = (timing or self.timing)(t)
+    def at_field_time(self, time: float) -> Gaussians:
+        """As `at`, at a time of the field, which `timing` tells apart from those of images."""
         if self.newest_at is not None and not torch.is_grad_enabled():
-            return self.newest_at(field_time)
-        return self.deformed(field_time).gaussians
+            return self.newest_at(time)
+        return self.deformed(time).gaussians
 
     def deformed(self, time: float, nearby: Nearby | None = None, time_samples: TimeSamples | None = None) -> Deformed:
         """The Gaussians at a time of the field, activated, with what the losses of motion compare. Differentiable as
@@ -209,13 +209,7 @@ class Scene4D:
         return move.apply_to_means(means), scales
 
     def render(
-        self,
-        camera: Camera,
-        t: float,
-        background: Tensor | Sequence[float] | None = None,
-        *,
-        depth: bool = True,
-        timing: Timing | None = None,
+        self, camera: Camera, t: float, background: Tensor | Sequence[float] | None = None, *, depth: bool = True
     ) -> Rendering:
         """Render the scene on the CPU, without gradients.
 
@@ -224,22 +218,25 @@ class Scene4D:
             t: time in [0, 1].
             background: (3,); None for black.
             depth: whether to render depth, see `rasterize`.
-            timing: takes the place of the scene's, as in `at`; None for the scene's.
         """
-        if background is not None:
-            background = torch.as_tensor(background, dtype=torch.float32)
-        with torch.no_grad():
-            now = self.at(t, timing=timing)
-            tensors = (now.means, now.quats, now.scales, now.opacities, now.sh)
-            return rasterize(
-                *tensors,
-                camera,
-                sh_degree=now.sh_degree,
-                background=background,
-                antialiased=now.antialiased,
-                depth=depth,
-                device=self.device,
-            )
+        return self.render_at_field_time(camera, self.timing(t), background, depth=depth)
+
+    @torch.no_grad()
+    def render_at_field_time(
+        self, camera: Camera, time: float, background: Tensor | Sequence[float] | None = None, *, depth: bool = True
+    ) -> Rendering:
+        """As `render` with this camera, background and depth, at a time of the field."""
+        now = self.at_field_time(time)
+        tensors = (now.means, now.quats, now.scales, now.opacities, now.sh)
+        return rasterize(
+            *tensors,
+            camera,
+            sh_degree=now.sh_degree,
+            background=None if background is None else torch.as_tensor(background, dtype=torch.float32),
+            antialiased=now.antialiased,
+            depth=depth,
+            device=self.device,
+        )
 
     def snapshot(self, t: float) -> GaussianSnapshot:
         """The Gaussians at time t in [0, 1] before their activations, as 3DGS viewers read them."""

@@ -21,14 +21,7 @@ from lapgs_wgpu.motion.fields.config import FieldConfig
 from lapgs_wgpu.motion.fields.parameter_shapes import parameter_shapes
 from lapgs_wgpu.motion.timing import EVEN, Timing, timing_of_text
 
-_SHAPES = {
-    "means": (3,),
-    "log_scales": (3,),
-    "quats": (4,),
-    "opacity_logits": (),
-    "sh_dc": (1, 3),
-    "sh_rest": (15, 3),
-}
+_SHAPES = {"means": (3,), "log_scales": (3,), "quats": (4,), "opacity_logits": (), "sh_dc": (1, 3), "sh_rest": (15, 3)}
 
 
 @dataclass(frozen=True, eq=False)

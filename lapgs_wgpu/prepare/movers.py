@@ -30,7 +30,10 @@ NOISE, NOISE_GROWS = 0.15, 0.05  # pixels of flow, at least: between neighbourin
 MOST = 30.0  # times the noise: larger errors are equal
 FEWEST = 2  # images around one, in which a place must be followed
 MOVES = 5.0  # times the noise, at least: it moves
+VOTED = 1.5  # times the noise, whose logarithm votes exceed that are parted into what moves and the rest
 HALO = 1.5  # times the error that parts what moves from the rest: flow bends around what moves
+FOLLOWED = 0.2  # of the area: where flow tells of less, nothing is masked
+LEAST = 0.002  # of an image that moves; less is noise
 SHARP = 2.5  # times the noise of the better of two reconstructions: it agrees
 RIM = np.pad(np.ones((42, 42), bool), 9)  # mask of all but an image's rim, which seldom shows what moves
 
@@ -152,46 +155,59 @@ class Judged(NamedTuple):
         return dict(zip(self.names, wider, strict=True))
 
 
-def judge(motion: Motion, model: Any) -> Judged:
-    """model: a pycolmap.Reconstruction of some of the flow's images."""
-    images = {motion.names.index(model.image(i).name): model.image(i) for i in model.reg_image_ids()}
-    poses = {i: np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for i, image in images.items()}
-    points = np.stack([point.xyz for point in model.points3D.values()])
-    stride = max(1, len(motion.names) // 20)
-    depths = [points @ pose[2, :3] + pose[2, 3] for i, pose in poses.items() if i % stride == 0]
-    nearest = float(np.median([np.percentile(depth[depth > 0], 5) for depth in depths if (depth > 0).any()] or [1.0]))
-    camera = next(iter(images.values())).camera
-    scale = camera.width / motion.images[0].shape[1]
-    focal = camera.mean_focal_length() / scale
+class _Solved:
+    """A pycolmap.Reconstruction of some of the flow's images, and how far the film misses it."""
 
-    def directions(at: Plane) -> Floats:
+    def __init__(self, motion: Motion, model: Any) -> None:
+        images = {motion.names.index(model.image(i).name): model.image(i) for i in model.reg_image_ids()}
+        self._motion = motion
+        self._poses = {i: np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for i, image in images.items()}
+        self._camera = next(iter(images.values())).camera
+        self._scale = self._camera.width / motion.images[0].shape[1]
+        points = np.stack([point.xyz for point in model.points3D.values()])
+        poses = [pose for i, pose in self._poses.items() if i % max(1, len(motion.names) // 20) == 0]
+        depths = [points @ pose[2, :3] + pose[2, 3] for pose in poses]
+        near = [np.percentile(depth[depth > 0], 5) for depth in depths if (depth > 0).any()]
+        self._nearest = float(np.median(near or [1.0]))
+
+    def _directions(self, at: Plane) -> Floats:
         flat = np.nan_to_num(at.reshape(-1, 2).astype(np.float64))
-        seen = np.asarray(camera.cam_from_img((flat + 0.5) * scale))
+        seen = np.asarray(self._camera.cam_from_img((flat + 0.5) * self._scale))
         return np.where(np.isfinite(at.reshape(-1, 2)), seen, np.nan)
 
-    def misses(i: int, noise_apart: NDArray[np.floating]) -> tuple[Floats, dict[int, Floats]]:
-        """Of the grid (rows columns,), and by offset, both in times the noise."""
-        tracks = {k: at for k, at in motion.tracks[i].items() if i + k in poses}
+    def misses(self, i: int, noise: NDArray[np.floating]) -> tuple[Floats, dict[int, Floats]]:
+        """Of the grid of image i (rows columns,), and by the offset of each image around it, in times the noise."""
+        poses, grid = self._poses, self._motion.grid
+        tracks = {k: at for k, at in self._motion.tracks[i].items() if i + k in poses}
         if i not in poses or len(tracks) < FEWEST:
-            return np.full(motion.grid[..., 0].size, np.nan), {}
+            return np.full(grid[..., 0].size, np.nan), {}
         relative = np.stack([poses[i + k] for k in tracks]) @ np.linalg.inv(poses[i])
-        seen = np.stack([directions(at) for at in tracks.values()])
-        sigma = np.array([noise_apart[abs(k)] for k in tracks]) / focal
+        seen = np.stack([self._directions(at) for at in tracks.values()])
+        sigma = np.array([noise[abs(k)] for k in tracks]) / (self._camera.mean_focal_length() / self._scale)
         # Nothing is nearer than half as far as the nearest points of the scene.
-        total, each = depth_errors(directions(motion.grid), seen, relative, sigma, 2 / nearest)
+        total, each = depth_errors(self._directions(grid), seen, relative, sigma, 2 / self._nearest)
         return total, dict(zip(tracks, each, strict=True))
 
-    noise = NOISE + NOISE_GROWS * np.arange(REACH + 1)
-    sampled = [misses(i, noise)[1] for i in range(0, len(motion.names), max(1, len(motion.names) // 12))]
-    for apart in range(1, REACH + 1):
-        errors = np.array([error for each in sampled for k, error in each.items() if abs(k) == apart])
-        if len(known := errors[np.isfinite(errors)]):
-            noise[apart] *= max(1.0, 1.55 * np.percentile(known, 25))  # the median, if all were noise
-    planes = np.stack([misses(i, noise)[0] for i in range(len(motion.names))], dtype=np.float32)
-    planes = planes.reshape(-1, *motion.grid.shape[:2])
-    votes = _votes(motion, planes)
-    limit = max(float(np.log(MOVES)), np.log(HALO) + _valley(votes[votes > np.log(1.5)]))
-    return Judged(motion.names, planes, votes, limit, float(noise[1]))
+    def noise(self) -> NDArray[np.floating]:
+        """(REACH + 1,) pixels, by how many images apart."""
+        noise, count = NOISE + NOISE_GROWS * np.arange(REACH + 1), len(self._motion.names)
+        sampled = [self.misses(i, noise)[1] for i in range(0, count, max(1, count // 12))]
+        for apart in range(1, REACH + 1):
+            errors = np.array([error for each in sampled for k, error in each.items() if abs(k) == apart])
+            if len(known := errors[np.isfinite(errors)]):
+                noise[apart] *= max(1.0, 1.55 * np.percentile(known, 25))  # the median, if all were noise
+        return noise
+
+
+def judge(motion: Motion, model: Any) -> Judged:
+    """model: a pycolmap.Reconstruction of some of the flow's images."""
+    solved = _Solved(motion, model)
+    noise = solved.noise()
+    errors = np.stack([solved.misses(i, noise)[0] for i in range(len(motion.names))], dtype=np.float32)
+    errors = errors.reshape(-1, *motion.grid.shape[:2])
+    votes = _votes(motion, errors)
+    limit = max(float(np.log(MOVES)), np.log(HALO) + _valley(votes[votes > np.log(VOTED)]))
+    return Judged(motion.names, errors, votes, limit, float(noise[1]))
 
 
 def depth_errors(ray: Floats, seen: Floats, relative: Floats, sigma: Floats, most: float) -> tuple[Floats, Floats]:
@@ -247,7 +263,7 @@ def _valley(values: NDArray[np.floating]) -> float:
 
 def cut_out(motion: Motion, judged: Judged) -> dict[str, Mask]:
     """Masks of what moves (h, w), of the size of the flow's images; none where flow tells of too little area."""
-    if judged.followed <= 0.2:
+    if judged.followed <= FOLLOWED:
         return {}
     planes = zip(motion.names, motion.images, judged.votes, strict=True)
     return {name: _cut(image, vote, judged.limit) for name, image, vote in planes}
@@ -263,7 +279,7 @@ def _cut(image: NDArray[np.uint8], vote: Plane, limit: float) -> Mask:
         return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
 
     moves = cv2.morphologyEx((value > limit).astype(np.uint8), cv2.MORPH_OPEN, disk(2))
-    if moves.mean() < 0.002:  # noise
+    if moves.mean() < LEAST:
         return np.zeros((height, width), bool)
     label = np.full((height, width), cv2.GC_BGD, np.uint8)
     label[cv2.dilate(moves, disk(10)) > 0] = cv2.GC_PR_BGD

@@ -23,12 +23,7 @@ _PLACES: dict[str, dict[str, Place]] = {
         "square": np.s_[-1:, 0:1],
         "moves": np.s_[-1:, 1:2],
     },
-    "exposure": {
-        "values": np.s_[:, :12],
-        "mean": np.s_[:, 12:24],
-        "square": np.s_[:, 24:36],
-        "steps": np.s_[:, 36:37],
-    },
+    "exposure": {"values": np.s_[:, :12], "mean": np.s_[:, 12:24], "square": np.s_[:, 24:36], "steps": np.s_[:, 36:37]},
 }
 
 
@@ -147,8 +142,7 @@ class ResidentCorrections:
         commands.dispatch(motion_kernel, 1, seen=seen, frame=frame, geometry=geometry, motion=motion)
         kernel = Kernel.get(self._device, "camera_step")
         descent = self._pool.varying(
-            "camera step",
-            lambda: kernel.uniform("CameraStep", number=self._camera, cameras=cameras, **self._pace),
+            "camera step", lambda: kernel.uniform("CameraStep", number=self._camera, cameras=cameras, **self._pace)
         )
         arrays = {"guard": guard, "motion": motion, "d_camera": self._d_camera, "common_motions": self._common}
         commands.dispatch(kernel, 1, descent=descent, cameras=self._camera_rows, **arrays)

@@ -15,7 +15,7 @@ from lapgs_wgpu.errors import NumericalError
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.io.initial_view import InitialView, captured_arc
 from lapgs_wgpu.motion.scene import Scene4D
-from lapgs_wgpu.motion.timing import EVEN, Timing
+from lapgs_wgpu.motion.timing import Timing
 from lapgs_wgpu.splat.rasterize import rasterizer_of
 from lapgs_wgpu.train.camera_refinement import CameraRefinement
 from lapgs_wgpu.train.config import Config
@@ -241,7 +241,7 @@ class Trainer:
         and of its colors."""
         camera, correction = self._learners.camera(view), self.exposure_of(view)
         background = self._truth.backgrounds[view]
-        image = self.scene.render(camera, t, background, depth=False, timing=EVEN).image
+        image = self.scene.render_at_field_time(camera, t, background, depth=False).image
         return image if correction is None else image @ correction[:, :3].T + correction[:, 3]
 
     # The state between two steps -------------------------------------------------------------------------------------
