@@ -25,7 +25,7 @@ class DataConfig(Options):
     background: Literal["black", "white"] = option("color behind the Gaussians and behind transparent images")
     cache_gb: float = option("memory limit for the images that are kept on the device, gigabytes")
     undistort: bool = option("undo distortion and skew of lenses; false: ignore them, and the principal point", True)
-    vary_background: bool = option("another random data.background for each image: surfaces become opaque", False)
+    vary_background: bool = option("a random, fixed background for each image, opaque or not: closes holes", False)
     units: Literal["world", "capture"] = option(
         "length unit of rates.means, smoothness.reach, field.bound and field.unit; capture: that of its files",
         "world",
@@ -68,7 +68,7 @@ class ScheduleConfig(Options):
     sh_interval: int = option("the degree of the spherical harmonics rises by one every N steps, up to 3", at_least=1)
     save_interval: int = option("save the state for --resume every N steps; 0: only if the training is interrupted")
     cool_down: float = option(
-        "fraction of the steps, the last, over which the learning rates fall in a straight line to 0", 0.0, at_most=1
+        "fraction of the steps, the last, over which the rates of Gaussians, hash and mlp fall to 0", 0.0, at_most=1
     )
 
 
@@ -113,7 +113,7 @@ class DensityConfig(Options):
         "image is 2 units wide)"
     )
     split: Literal["plain", "adaptive"] = option(
-        "which large Gaussians are split; plain: all; adaptive: the 60 % least like their neighbors (the paper)"
+        "which large Gaussians split; plain: all; adaptive: the 60 % least like neighbors in shape and dynamics"
     )
     min_opacity: float = option("prune Gaussians with a lower opacity", at_least=0, below=1)
     max_world_size: float = option(
@@ -207,9 +207,9 @@ class DiscoveryConfig(Options):
     )
     steps: int = option("steps of the static fit before discovery; cameras all around: none", 800, at_least=1)
     size: int = option("longer side of the images for discovery, pixels; cameras all around: 160", 100, at_least=16)
-    field_steps: int = option("steps that fit a field to what was found; on a rig at least 30 a time", 1500, at_least=1)
+    field_steps: int = option("steps that fit a field to what was found; all around: >= 30 a time", 1500, at_least=1)
     least: float = option(
-        "start without what was found where it covers less than this fraction of what moves",
+        "start from the static fit alone if less than this fraction of what moves was found",
         0.05,
         at_most=1,
     )

@@ -56,7 +56,7 @@ class FieldConfig(Options):
         "deformation field, as for --field, but nothing else changes with it; own: a module given in Python",
         "laplacian",
     )
-    bound: float = option("half side length of the field's cube, world units", 1.6, above=0, below=1e6)
+    bound: float = option("half side of its cube, world units; all outside moves alike", 1.6, above=0, below=1e6)
     unit: float = option(
         "how far an output of 1 moves a Gaussian, world units; more lets things learn to move and change size faster",
         1.0,
@@ -78,7 +78,7 @@ class FieldConfig(Options):
     time_scale: float = option(
         "share of the space-time grids' time axis for the clip, in its middle", 0.9, above=0, at_most=1
     )
-    temporal_hash: bool = option("use the space-time hash grids (grid4d, laplacian)", True)
+    temporal_hash: bool = option("space-time hash grids (grid4d, laplacian); without, grid4d stands still", True)
     motion: Literal["laplacian", "mlp"] = option(
         "how laplacian decodes motion; laplacian: as a sum of sinusoids, the motion spectrum; mlp: from features and "
         "time",
@@ -94,7 +94,7 @@ class FieldConfig(Options):
         "initial spacing of the spectrum's frequencies, which start at 0, cycles per clip", 1.0, above=0, below=1e6
     )
     amplitude: float = option(
-        "initial standard deviation over time of the spectrum's sums of sinusoids, which scale the decoder's features",
+        "initial standard deviation over time of the spectrum's sums of sinusoids; more: moves sooner, but may flicker",
         0.3,
         above=0,
         below=1e6,
