@@ -86,7 +86,7 @@ def find_tracks(clouds: PointClouds) -> Tracks | None:
     """
     closest, best = 0.0, None
     for trajectories in find_trajectories(clouds):
-        for many in (0.5, 0.75):
+        for many in (0.5, 0.75):  # quantiles over the times
             if (tracks := _tracks_by(many, clouds, trajectories)) is None:
                 continue
             apart = [distances / (CLOSE * clouds.half_side) for distances, _ in clouds.nearest(tracks.paths)]
@@ -101,7 +101,7 @@ def _tracks_by(many: float, clouds: PointClouds, trajectories: list[Trajectory])
     """The tracks from key times at which as many parts are apart as this quantile of all times has."""
     free = [np.ones(len(cloud.scores), bool) for cloud in clouds.clouds]
     found: list[Tracks] = []
-    for _ in range(4):
+    for _ in range(4):  # key times
         rest = [cloud.chosen(mask) for cloud, mask in zip(clouds.clouds, free, strict=True)]
         key = _key_time(rest, many, clouds)
         if sum(len(points.scores) for points in rest) < 0.05 * clouds.total or key is None:
@@ -157,7 +157,7 @@ def _tracks_from(
     """The points of a key time, followed twice: first those of that time, then with all that belongs to them; and their
     paths before these were smoothed, which are nearer to the points of each time."""
     found = None
-    for most, least in (150, 1), (300, 3):
+    for most, least in (150, 1), (300, 3):  # points in all; surface points of each voxel
         if found is not None:
             start = _at_key_time(key, found[0].paths, clouds)
         follower = Follower(_voxels(start, VOXEL * clouds.half_side, least).thinned(most), key, clouds, trajectories)

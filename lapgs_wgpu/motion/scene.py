@@ -60,8 +60,8 @@ class Scene4D:
 
     Attributes:
         field_config: configuration of the field.
-        on_access: called with "gaussians" or "field" before these are given out: a device may have newer ones.
-        newest_at: gives the Gaussians at a time of the field, where a training keeps newer ones there; else None.
+        on_access: called with "gaussians" or "field" before these are given out: a training device may have newer ones.
+        newest_at: gives what `at_field_time` does without gradients, while a device trains; else None.
         device: that renders.
         sh_degree: degree of the harmonics in use, 0 to 3.
         antialiased: how the Gaussians are drawn, see Gaussians.
@@ -82,7 +82,7 @@ class Scene4D:
     ) -> None:
         """Make a scene of Gaussians and a field that is new. Raises InputError where own_field does not fit the kind.
 
-        parameters: as the attribute; copied. seed: of the field's initial parameters. own_field: a module in place of
+        parameters: as the property; copied. seed: of the field's initial parameters. own_field: a module in place of
         the configured field (docs/api.md). The others are as the attributes.
         """
         check_own(field_config, own_field)
@@ -167,7 +167,7 @@ class Scene4D:
         return self.at_field_time(self.timing(t))
 
     def at_field_time(self, time: float) -> Gaussians:
-        """As `at`, at a time of the field, which `timing` tells apart from those of images."""
+        """As `at`, at a time of the field, to which `timing` maps those of images."""
         if self.newest_at is not None and not torch.is_grad_enabled():
             return self.newest_at(time)
         return self.deformed(time).gaussians

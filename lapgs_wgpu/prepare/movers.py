@@ -30,8 +30,8 @@ NOISE, NOISE_GROWS = 0.15, 0.05  # pixels of flow, at least: between neighbourin
 MOST = 30.0  # times the noise: larger errors are equal
 FEWEST = 2  # images around one, in which a place must be followed
 MOVES = 5.0  # times the noise, at least: it moves
-VOTED = 1.5  # times the noise, whose logarithm votes exceed that are parted into what moves and the rest
-HALO = 1.5  # times the error that parts what moves from the rest: flow bends around what moves
+VOTED = 1.5  # times the noise: the border between still and moving is looked for among larger votes only
+HALO = 1.5  # times that border: flow bends around what moves
 FOLLOWED = 0.2  # of the area: where flow tells of less, nothing is masked
 LEAST = 0.002  # of an image that moves; less is noise
 SHARP = 2.5  # times the noise of the better of two reconstructions: it agrees
@@ -145,8 +145,8 @@ class Judged(NamedTuple):
         return [name for name, wrong in zip(self.names, off, strict=True) if wrong]
 
     def rough(self, *, turned_over: bool = False) -> dict[str, Mask]:
-        """Masks on the grid, a little wider than what moves. turned_over: than what agrees, in images that disagree at
-        least half as much as the worst one: their cameras may follow what moves."""
+        """Masks on the grid, a little wider than what moves. turned_over: of what agrees instead, in images that
+        disagree at least half as much as the worst one: their cameras may follow what moves."""
         masks = self.votes > self.limit
         if turned_over:
             share = masks.mean(axis=(1, 2), keepdims=True)
