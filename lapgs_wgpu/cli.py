@@ -58,8 +58,8 @@ keys of the configuration [in brackets: values of the preset {preset}]:
   "World units" are those of the scene after it was moved and scaled into the cube from -1.3 to 1.3; D-NeRF scenes keep
   their coordinates. "The cameras' extent" is 1.1 times the largest distance of a training camera from their mean. "With
   discovery" means: if the training starts with motion discovery (discovery.enabled). "The paper" is "Laplacian Analysis
-  Meets Dynamics Modelling". Learning rates (rates, and .rate of others) are Adam's: they change exponentially from
-  .start to .end, which they reach at step .steps; a parameter with the rate 0 does not change."""
+  Meets Dynamics Modelling". Learning rates (rates, and .rate of others) are Adam's: they change exponentially, from or
+  to 0 in a straight line, from .start to .end, which they reach at step .steps; with both 0, nothing changes."""
 _METAVARS = {int: "INT", float: "FLOAT", str: "TEXT", bool: "true|false"}
 
 

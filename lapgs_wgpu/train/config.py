@@ -205,7 +205,7 @@ class DiscoveryConfig(Options):
         "if schedule.steps is at most discovery.steps. Limits rates.hash and rates.mlp where it finds nearly all",
         False,
     )
-    steps: int = option("steps of the static fit before discovery; cameras all around: none", 800, at_least=1)
+    steps: int = option("steps of the static fit, before step 1; cameras all around: none", 800, at_least=1)
     size: int = option("longer side of the images for discovery, pixels; cameras all around: 160", 100, at_least=16)
     field_steps: int = option("steps that fit a field to what was found; all around: >= 30 a time", 1500, at_least=1)
     least: float = option(

@@ -56,7 +56,7 @@ class FieldConfig(Options):
         "deformation field, as for --field, but nothing else changes with it; own: a module given in Python",
         "laplacian",
     )
-    bound: float = option("half side of its cube, world units; all outside moves alike", 1.6, above=0, below=1e6)
+    bound: float = option("half side of its cube, world units; outside: a single motion", 1.6, above=0, below=1e6)
     unit: float = option(
         "how far an output of 1 moves a Gaussian, world units; more lets things learn to move and change size faster",
         1.0,
