@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from lapgs_wgpu.discovery.residual import Floats, Mask, Residual
 from lapgs_wgpu.discovery.tracks import Tracks, all_of, parabolas
-from lapgs_wgpu.discovery.turns import harmonics
+from lapgs_wgpu.discovery.turns import Doubles, harmonics
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.linear_light import directions
 from lapgs_wgpu.splat.rasterize import rasterize
@@ -25,8 +25,6 @@ RATES = {"points": 2e-3, "colors": 2e-2, "sizes": 1e-2, "opacities": 3e-2, "ligh
 LAST = 0.05  # of these rates, in the end; they fall over the second half
 UNEXPLAINED = 0.3  # of what the static fit lacks where a body is: more is left over of what is not rigid
 SPREADS = {"turns": 4.0, "shifts": 2.0}  # time steps; of the weights by which parabolas are fitted around each time
-
-Doubles = NDArray[np.float64]
 
 
 def rigid_tracks(
