@@ -69,7 +69,7 @@ def test_views_are_spread_over_the_cameras_of_a_rig(size: tuple[int, int]) -> No
     assert np.diff([view.time for view in chosen]).max() <= 0.12
 
 
-def test_moments_are_those_of_one_still_camera() -> None:
+def test_times_are_counted_by_one_still_camera() -> None:
     """Of cameras that are not in step; where each image has a camera of its own, there are as many as times."""
     other = dataclasses.replace(CAMERA)
     views = [

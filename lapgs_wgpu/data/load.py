@@ -213,15 +213,15 @@ def _views(frames: Sequence[Frame], size: Size, *, shared: bool) -> list[View]:
             resized = lens.resized(*stored)
             undistortions[lens] = Undistortion(resized, resized.pinhole(frame.where))
         undistortion = undistortions[lens]
-        K, taken = (lens.K, lens.size) if lens.is_pinhole else (undistortion.K, stored)
-        camera = Camera(K, frame.T_cam_world, *taken).resized(*size)
-        if shared:
-            camera = cameras.setdefault((lens, frame.T_cam_world.tobytes()), camera)
+        key = lens, frame.T_cam_world.tobytes()
+        if not (shared and key in cameras):
+            K, taken = (lens.K, lens.size) if lens.is_pinhole else (undistortion.K, stored)
+            cameras[key] = Camera(K, frame.T_cam_world, *taken).resized(*size)
         load = partial(_pixels, frame.image, undistortion, size)
         mask = partial(read_mask, undistortion=undistortion, size=size)
         ignored = partial(mask, frame.mask, frame.mask_kind) if frame.mask and frame.split == "train" else None
         moving = partial(mask, frame.moving, "white", above=MOSTLY) if frame.moving else None
-        views.append(View("", camera, frame.time, str(frame.image), load, ignored, moving))
+        views.append(View("", cameras[key], frame.time, str(frame.image), load, ignored, moving))
     return views
 
 

@@ -134,7 +134,7 @@ class Dataset:
 
     @property
     def time_gap(self) -> float:
-        """The usual distance in time from one moment to the next."""
+        """The usual distance from one time to the next."""
         return time_step(self.times) if self.time_count == len(self.times) else 1 / (self.time_count - 1)
 
     @cached_property
