@@ -23,7 +23,7 @@ from lapgs_wgpu.train.presets import load_config
 from lapgs_wgpu.train.setup import open_data
 
 RATE = 24  # frames a second
-LIMIT = "24000"  # Gaussians
+LIMIT = "36000"  # Gaussians
 
 
 def write_true_masks(annotations: Path, capture: Path) -> Path:

@@ -10,19 +10,21 @@ import torch
 from helpers.captures import bright, write_colmap, write_rig
 from helpers.films import Board, drawn, room_cloud, walk
 from PIL import Image
+from scipy import ndimage
 
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.placement import mover_cube
 from lapgs_wgpu.data.views import View, composite, small_views
 from lapgs_wgpu.discovery.cutouts import cutout_tracks
-from lapgs_wgpu.discovery.discover import start_training
+from lapgs_wgpu.discovery.discover import Found, scene_with, start_training
+from lapgs_wgpu.discovery.field_fit import fit_field
 from lapgs_wgpu.discovery.residual import Residual
 from lapgs_wgpu.discovery.static_fit import depth_of, static_fit
 from lapgs_wgpu.discovery.tracks import Tracks
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.device import Device
-from lapgs_wgpu.motion.scene import Scene4D
+from lapgs_wgpu.motion.scene import Scene4D, isotropic_rows
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.evaluate import evaluate
 from lapgs_wgpu.train.presets import load_config
@@ -73,6 +75,54 @@ def test_cutouts_go_on_where_the_images_have_a_gap() -> None:
         for k in range(tracks.parts):
             pixels, _ = CAMERAS[number].project(tracks.paths[i, tracks.part == k])
             assert pixels.mean(axis=0) == pytest.approx(middle, abs=20)
+
+
+def test_a_cutout_bends() -> None:
+    """A band whose middle sways beside its ends; affine maps would miss the rows by up to 2 pixels."""
+    rows, columns = np.mgrid[:96, :128].astype(np.float64)
+    colors = np.random.default_rng(4).uniform(0.2, 0.9, (16, 8, 3))
+    camera, times = CAMERAS[0], np.linspace(0, 1, 9)
+    residuals = []
+    for t in times:
+        across, down = columns - 40 - sway(rows, t), rows - 18
+        mask = (across >= 0) & (across < 30) & (down >= 0) & (down < 60)
+        at = [down[mask] / 60 * 15, across[mask] / 30 * 7]
+        image = np.full((96, 128, 3), 0.5, np.float32)
+        image[mask] = np.stack([ndimage.map_coordinates(colors[..., i], at, order=1) for i in range(3)], axis=1)
+        residuals.append(Residual(camera, float(t), image, np.full_like(image, 0.5), mask))
+    tracks, share = cutout_tracks(residuals, [np.full((96, 128), FAR, np.float32)] * len(times), 1.3)
+    assert tracks is not None
+    assert tracks.parts == 1
+    assert share > 0.95
+    places = np.stack([camera.project(path)[0] - 0.5 for path in tracks.paths])
+    start = places[0, :, 0] - sway(places[0, :, 1], 0.0)
+    off = [at[:, 0] - start - sway(at[:, 1], float(t)) for t, at in zip(times, places, strict=True)]
+    assert np.abs(off).mean() < 0.4
+
+
+def sway(rows: np.ndarray, t: float) -> np.ndarray:
+    """Pixels to the right."""
+    return 8 * t * np.sin(np.pi * (rows - 18) / 60)
+
+
+def test_sheets_are_shown_one_after_another(device: Device) -> None:
+    times, parts = np.linspace(0, 1, 40), 20
+    number = np.repeat(np.arange(parts), 10)
+    supported = np.arange(40)[:, None] // 2 == number
+    draw = np.random.default_rng(5)
+    positions = draw.uniform(-0.3, 0.3, (len(number), 3)).astype(np.float32)
+    paths = positions + 0.2 * np.sin(6 * times)[:, None, None].astype(np.float32)
+    tracks = Tracks(positions, draw.uniform(0, 1, (len(number), 3)).astype(np.float32), number, paths, supported)
+    config, generator = load_config("film", {"points.count": "100"}), torch.Generator().manual_seed(0)
+    rows = isotropic_rows(np.full((100, 3), 0.9, np.float32), np.zeros((100, 3), np.float32), np.full(100, 0.1), 0.5)
+    static = Scene4D(rows, load_config("film", {"field.kind": "static"}).field, device)
+    scene = scene_with(Found(static, tracks, times, 1.0, "", {}, sheets=True), config, generator, None)
+    assert fit_field(scene, tracks, times, 400, generator, lambda step: None, fades=True, light={}) is not None
+    for i in range(4, 36):
+        opacities = scene.at(times[i]).opacities.detach().numpy()[100:]
+        assert np.median(opacities[supported[i]]) > 0.7
+        assert np.median(opacities[supported[i - 4]]) < 0.1
+        assert np.median(opacities[supported[i + 4]]) < 0.1
 
 
 def test_what_is_far_behind_a_gap_adds_little_to_a_depth(device: Device) -> None:

@@ -11,36 +11,41 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from lapgs_wgpu.data.cloud import points_at
 from lapgs_wgpu.data.evenly import evenly_indices
 from lapgs_wgpu.discovery.residual import Floats, Mask, Residual
 from lapgs_wgpu.discovery.tracks import Tracks
 
-MOST = 24  # cut-outs
+MOST = 40  # cut-outs
 LEAST = 4e-3  # share of an image that a cut-out covers, at least
 ENOUGH = 0.15  # share of an image's moving pixels that may stay unexplained
 BLURS = 4.0, 2.0, 1.0  # pixels; of the images that are compared, one after another
 NEWS = 0.5  # share of what a cut-out explains in an image that none of a nearer image does, at least
-POINTS = 12_000  # of all cut-outs, at most
+POINTS = 18_000  # of all cut-outs, at most
 ALIKE = 0.12  # difference of two blurred colors that look alike
-LOST, VISIBLE = 0.5, 0.3  # shares of a cut-out that must look alike, and lie in the image
-STIFF = 0.02  # weight of the affine part of a map against that before
+LOST, VISIBLE = 0.65, 0.3  # shares of a cut-out that must look alike, and lie in the image
+COMPARED = 1500  # pixels of a cut-out
+NEAR = 2.0  # pixels, from one of a cut-out: it explains a pixel
+KNOTS = 8  # pixels, about, between two at which a cut-out bends
+TENSION, AFFINE = 0.05, 0.05  # weights of how bends differ from knot to knot; of bends alike, which the map is for
+STIFF = 0.02  # weight of a change from one image to the next
 FOOT = 0.15  # of its height: the lowest part of a cut-out, which stands on the ground
 HIDDEN, BEFORE = 0.1, 0.9  # quantile of the depths of what a cut-out hides; how far before that and the ground it is
 APART = -0.5, 0.5  # half sides of the box: how far the first and the last cut-out are moved away from the cameras
 FAR_BELOW = 3  # pixels; the ground that a foot stands on lies so far below
 
-Map = NDArray[np.float64]
+Weights = NDArray[np.float64]
 
 
 class _Cutout(NamedTuple):
-    """pixels: (n, 2) columns and rows. maps: (T, 2, 3) to the pixels of each image. seen: (T,). explained: (T, H, W),
+    """pixels: (n, 2) columns and rows. at: (T, n, 2) where they are in each image. seen: (T,). explained: (T, H, W),
     what it explains of each mask."""
 
     key: int
     pixels: NDArray[np.int64]
-    maps: Map
+    at: Floats
     seen: NDArray[np.bool_]
     explained: Mask
 
@@ -136,53 +141,76 @@ def _levels(residual: Residual) -> list[Floats]:
 
 def _followed(levels: Sequence[list[Floats]], masks: Mask, key: int, pixels: NDArray[np.int64]) -> _Cutout:
     """Follow a cut-out to both ends of the clip."""
-    maps, seen = np.tile(np.eye(2, 3), (len(masks), 1, 1)), np.zeros(len(masks), bool)
-    explained = np.zeros_like(masks)
+    sheet, at = _Sheet(pixels), np.tile(pixels.astype(np.float32), (len(masks), 1, 1))
+    seen, explained = np.zeros(len(masks), bool), np.zeros_like(masks)
     seen[key] = explained[key, pixels[:, 1], pixels[:, 0]] = True
-    near = ndimage.binary_dilation(explained[key]).astype(np.float32)
     for way in (-1, 1):
-        before, step = np.eye(2, 3), np.zeros((2, 3))
-        for at in range(key + way, len(masks) if way > 0 else -1, way):
+        before = step = np.zeros((sheet.basis.shape[1], 2))
+        for t in range(key + way, len(masks) if way > 0 else -1, way):
             found, alike = max(
-                (_registered(levels[key], levels[at], pixels, start) for start in (before + step, before)),
+                (_registered(levels[key], levels[t], sheet, start) for start in (before + step, before)),
                 key=lambda each: each[1],
             )
             if alike < LOST:
                 break
-            maps[at], seen[at] = found, True
+            at[t], seen[t] = pixels + sheet.basis @ found, True
             step, before = found - before, found
-            explained[at] = _explained(levels[key], levels[at], masks[at], near, found)
-    return _Cutout(key, pixels, maps, seen, explained)
+            explained[t] = _explained(levels[key], levels[t], masks[t], pixels, at[t])
+    return _Cutout(key, pixels, at, seen, explained)
 
 
-def _registered(source: list[Floats], target: list[Floats], pixels: NDArray[np.int64], M: Map) -> tuple[Map, float]:
-    """The map (2, 3) of a cut-out's pixels to another image, near M, and the share of them that look alike there."""
-    chosen = pixels[evenly_indices(len(pixels), 1500)]
-    x, y = chosen.T
-    middle = chosen.mean(axis=0)
-    scale = max(float(chosen.std()), 1.0)
-    basis = np.column_stack([(chosen - middle) / scale, np.ones(len(chosen))])
+class _Sheet:
+    """How the pixels (n, 2) of a cut-out may go: basis (n, 3 + k) @ weights (3 + k, 2) is how far, by an affine map and
+    by bends at k knots. tension: (3 + k, 3 + k), what bends cost that differ from those at the knots beside them."""
+
+    def __init__(self, pixels: NDArray[np.int64]) -> None:
+        self.pixels = pixels[evenly_indices(len(pixels), COMPARED)]
+        middle, scale = self.pixels.mean(axis=0), max(float(self.pixels.std()), 1.0)
+        inside = pixels - pixels.min(axis=0)
+        knots = [np.linspace(0, most, max(2, 1 + round(most / KNOTS))) for most in np.maximum(inside.max(axis=0), 1)]
+        across, down = (np.maximum(0, 1 - np.abs(inside[:, i, None] - at) / at[1]) for i, at in enumerate(knots))
+        bends = (across[:, :, None] * down[:, None]).reshape(len(pixels), -1)
+        self.basis = np.concatenate([(pixels - middle) / scale, np.ones((len(pixels), 1)), bends], axis=1)
+        self.compared = self.basis[evenly_indices(len(pixels), COMPARED)].astype(np.float32)
+        steps = [np.diff(np.eye(len(at)), axis=0) for at in knots]
+        beside = np.kron(steps[0].T @ steps[0], np.eye(len(knots[1])))
+        beside += np.kron(np.eye(len(knots[0])), steps[1].T @ steps[1])
+        self.tension = np.zeros((self.basis.shape[1], self.basis.shape[1]))
+        self.tension[3:, 3:] = TENSION * (beside + AFFINE * np.eye(len(beside)))
+
+
+def _registered(source: list[Floats], target: list[Floats], sheet: _Sheet, start: Weights) -> tuple[Weights, float]:
+    """How a cut-out goes to another image, near `start`, and the share of its pixels that look alike there."""
+    x, y = sheet.pixels.T
     height, width = source[0].shape[:2]
-    for there, here in zip(target, source, strict=True):
-        wanted = here[y, x, :4]
+    weights = start.copy()
+    for blur, there, here in zip(BLURS, target, source, strict=True):
+        wanted, count = here[y, x, :4], 3 if blur == BLURS[0] else len(start)
+        basis, tension = sheet.compared[:, :count], sheet.tension[:count, :count]
         for _ in range(8):
-            at = M[:, :2] @ chosen.T + M[:, 2:]
+            at = (sheet.pixels + sheet.compared @ weights).T
             inside = (at >= 0).all(axis=0) & (at[0] <= width - 1) & (at[1] <= height - 1)
             sampled = _sampled(there, at)
             difference = sampled[:, :4] - wanted
             size = np.sqrt(np.square(difference[:, :3]).sum(axis=1))
             weight = (inside / (1 + np.square(size / ALIKE))).astype(np.float32)
-            J = (sampled[:, 4:].reshape(-1, 2, 4, 1) * basis[:, None, None]).transpose(0, 2, 1, 3).reshape(-1, 6)
+            J = (
+                (sampled[:, 4:].reshape(-1, 2, 4, 1) * basis[:, None, None])
+                .transpose(0, 2, 1, 3)
+                .reshape(-1, 2 * count)
+            )
             weighted = J * np.repeat(weight, 4)[:, None]
             H = (weighted.T @ J).astype(np.float64)
-            ridge = STIFF * np.trace(H) / 6 * np.diag([1, 1, 0.01, 1, 1, 0.01])
-            change = -np.linalg.solve(H + ridge + 1e-6 * np.eye(6), weighted.T @ difference.ravel())
-            A = change.reshape(2, 3) / [scale, scale, 1]
-            M = M + np.column_stack([A[:, :2], A[:, 2] - A[:, :2] @ middle])
+            scale = np.trace(H) / len(H)
+            stiff = np.diag([STIFF, STIFF, 0.01 * STIFF, *[STIFF] * (count - 3)])
+            slope = (weighted.T @ difference.ravel()).reshape(2, count) + scale * weights[:count].T @ tension
+            H += np.kron(np.eye(2), scale * (stiff + tension)) + 1e-6 * np.eye(len(H))
+            change = np.linalg.solve(H, slope.ravel()).reshape(2, count)
+            weights[:count] -= change.T
             if np.abs(change).max() < 0.02:
                 break
     alike = float((inside & (size < ALIKE) & (sampled[:, 3] > 0.5)).sum() / max(inside.sum(), 1))
-    return M, alike if inside.mean() > VISIBLE else 0.0
+    return weights, alike if inside.mean() > VISIBLE else 0.0
 
 
 def _sampled(planes: Floats, at: NDArray[np.float64]) -> Floats:
@@ -197,15 +225,15 @@ def _sampled(planes: Floats, at: NDArray[np.float64]) -> Floats:
     return above * (1 - b) + below * b
 
 
-def _explained(source: list[Floats], target: list[Floats], mask: Mask, near: Floats, M: Map) -> Mask:
-    """(H, W) the moving pixels of another image that look like those of the cut-out that a map takes there. near:
-    (H, W) 1 in the cut-out and beside it, else 0."""
+def _explained(source: list[Floats], target: list[Floats], mask: Mask, pixels: NDArray[np.int64], at: Floats) -> Mask:
+    """(H, W) the moving pixels of another image that look like those of a cut-out that come to lie there."""
     result = np.zeros_like(mask)
     rows, columns = np.nonzero(mask)
-    back = np.linalg.inv(M[:, :2]) @ (np.stack([columns, rows]) - M[:, 2:])
-    inside = ndimage.map_coordinates(near, back[::-1], order=0) > 0
-    alike = np.abs(_sampled(source[1][..., :3], back) - target[1][rows, columns, :3]).max(axis=1) < ALIKE
-    result[rows, columns] = inside & alike
+    distances, nearest = cKDTree(at).query(np.stack([columns, rows], axis=1), distance_upper_bound=NEAR)
+    rows, columns, nearest = (each[np.isfinite(distances)] for each in (rows, columns, nearest))
+    x, y = pixels[nearest].T
+    alike = np.abs(source[1][y, x, :3] - target[1][rows, columns, :3]).max(axis=1) < ALIKE
+    result[rows, columns] = alike
     return result
 
 
@@ -236,9 +264,10 @@ def _depths(mask: Mask, depth: Floats) -> Floats:
 
 def _placed(cutout: _Cutout, images: Sequence[Residual], depths: Sequence[Floats], most: int) -> tuple[Floats, Floats]:
     """The paths (T, n, 3) and colors (n, 3) of a cut-out, of so many points at most."""
-    chosen = cutout.pixels[evenly_indices(len(cutout.pixels), most)]
+    picked = evenly_indices(len(cutout.pixels), most)
+    chosen = cutout.pixels[picked]
     x, y = chosen.T
-    at = np.einsum("tij,jn->tin", cutout.maps[:, :, :2], chosen.T) + cutout.maps[:, :, 2:]
+    at = cutout.at[:, picked].transpose(0, 2, 1)
     height, width = depths[0].shape
     seen = np.flatnonzero(cutout.seen).tolist()
     inverse: dict[int, float] = {}

@@ -18,7 +18,7 @@ from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.initial_gaussians import initial_scales
 from lapgs_wgpu.data.views import Dataset
 from lapgs_wgpu.discovery.cutouts import cutout_tracks
-from lapgs_wgpu.discovery.field_fit import fit_field
+from lapgs_wgpu.discovery.field_fit import SHEET_DYNAMICS, fit_field
 from lapgs_wgpu.discovery.residual import Floats, Residual
 from lapgs_wgpu.discovery.rigid_fit import rigid_tracks
 from lapgs_wgpu.discovery.static_fit import static_fit
@@ -40,16 +40,15 @@ from lapgs_wgpu.train.setup import Start, set_up, start_from_points
 from lapgs_wgpu.train.trainer import Trainer
 
 DYNAMICS = 0.5  # standard deviation of the dynamics attribute of a discovered Gaussian, which it shares with its part
-SHEET_DYNAMICS = 2.0  # in place of it: of all sheets, and of the last one's time
 NEARLY_ALL = 0.8  # share of the surface points that tracks explain, above which the field has little left to learn
 ALL_TURN = 0.1  # of the field's highest rates, where all that moves turns: it forgets turns sooner than places
-SHEETS = 0.3  # in place of it where sheets fade one after another: small ones are lost at higher rates
+SHEETS = 0.1  # in place of it where sheets fade one after another: small ones are lost at higher rates
 FIT_STEPS_PER_TIME = 30  # of `fit_field` on a rig, at least: what flies fast is lost by fewer
 RAMP_STEPS = 200  # over which learning rates rise after discovery, where schedule.warm_up is 0
 FOLLOWING = "motion discovery: following what moves from one time to the next"  # may take a minute
 SHOWN = 2.0 / 255  # of a channel: least difference from the background, and by which a part changes a pixel
 SCALE, OPACITY = 0.4, 0.3  # of a track's Gaussian, in distances to its neighbours: low, since more lie behind it
-SHEET_SCALE, SHEET_OPACITY = 1.2, 0.9  # the same of parts that are sheets
+SHEET_SCALE, SHEET_OPACITY = 0.7, 0.9  # the same of parts that are sheets
 MOVING = 0.5  # share of the pixels in which a part shows that move, at least
 GAIN = 0.05  # or share of the static fit's error there that it takes away: where several images show each time
 NEAR = 0.1  # box half sides; distance within which a track explains a surface point
@@ -109,7 +108,7 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
     found = found or _in_residuals(config, dataset, device, generator)
     if found.share < config.discovery.least:
         found = found._replace(tracks=None)
-    scene = _scene_with(found, config, generator, own_field)
+    scene = scene_with(found, config, generator, own_field)
     field_fitted, summary = 0.0, f"{found.share:.1%} of what it lacks can be followed: nothing is added"
     if (tracks := found.tracks) is not None:
         parts, bodies = len(np.unique(tracks.part)), len(found.light)
@@ -119,7 +118,7 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
         meter.clear()
         if error is None:
             summary = "the field cannot move what it lacks: nothing is added"
-            scene = _scene_with(found._replace(tracks=None), config, generator, own_field)
+            scene = scene_with(found._replace(tracks=None), config, generator, own_field)
         else:
             summary = (
                 f"{parts} moving parts with {len(tracks.part)} Gaussians, {found.share:.0%} of what it lacks, followed "
@@ -140,7 +139,7 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
     )
 
 
-class _Found(NamedTuple):
+class Found(NamedTuple):
     """static: what stands still, and origin: in words. tracks: of what moves, over the times (T,), and the share of its
     points that they explain. light: on rigid bodies. sheets: whether parts are sheets. corrections: of cameras."""
 
@@ -154,7 +153,7 @@ class _Found(NamedTuple):
     corrections: Corrections | None = None
 
 
-def _in_hull(config: Config, dataset: Dataset, device: Device) -> _Found | None:
+def _in_hull(config: Config, dataset: Dataset, device: Device) -> Found | None:
     """What moves between cameras all around, before initial points; None where nothing can be followed."""
     clouds = hull_points(dataset, config.points.box)
     meter = Progress(1, "")
@@ -164,10 +163,10 @@ def _in_hull(config: Config, dataset: Dataset, device: Device) -> _Found | None:
     share = explained_share(clouds, tracks)
     if share < config.discovery.least:
         return None
-    return _Found(start_from_points(config, dataset, device).scene, tracks, clouds.times, share, "a start", {})
+    return Found(start_from_points(config, dataset, device).scene, tracks, clouds.times, share, "a start", {})
 
 
-def _in_residuals(config: Config, dataset: Dataset, device: Device, generator: torch.Generator) -> _Found:
+def _in_residuals(config: Config, dataset: Dataset, device: Device, generator: torch.Generator) -> Found:
     """What moves where the training images differ from a static fit. Raises InputError where they show nothing."""
     half_side, steps = config.points.box, config.discovery.steps
     meter = Progress(steps, "steps of motion discovery, part 1 of 2: what stands still")
@@ -183,7 +182,7 @@ def _in_residuals(config: Config, dataset: Dataset, device: Device, generator: t
         tracks, share = cutout_tracks(images, depths, half_side)
         meter.clear()
         times = np.array([image.time for image in images])
-        return _Found(static, tracks, times, share, "a static fit", {}, sheets=True, corrections=corrections)
+        return Found(static, tracks, times, share, "a static fit", {}, sheets=True, corrections=corrections)
     clouds = surface_points(images, half_side)
     times, tracks, light = clouds.times, find_tracks(clouds), dict[int, Floats]()
     if tracks is not None:
@@ -195,7 +194,7 @@ def _in_residuals(config: Config, dataset: Dataset, device: Device, generator: t
         if turns:
             tracks, light = rigid_tracks(tracks, stands, turns, times, images, device, generator)
     meter.clear()
-    return _Found(static, tracks, times, share, "a static fit", light, corrections=corrections)
+    return Found(static, tracks, times, share, "a static fit", light, corrections=corrections)
 
 
 def tracks_in_images(
@@ -250,7 +249,7 @@ def rows_with(static: Scene4D, tracks: Tracks, *, sheets: bool = False) -> dict[
     return {name: torch.cat([static.parameters[name].detach(), values]) for name, values in new.items()}
 
 
-def _scene_with(found: _Found, config: Config, generator: torch.Generator, own_field: nn.Module | None) -> Scene4D:
+def scene_with(found: Found, config: Config, generator: torch.Generator, own_field: nn.Module | None) -> Scene4D:
     """The Gaussians of what stands still, then one for each track; the field does not move them yet."""
     static, tracks, size = found.static, found.tracks, config.field.dynamics_size
     rows: dict[str, Tensor] = dict(static.parameters)

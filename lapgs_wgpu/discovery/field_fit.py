@@ -24,8 +24,10 @@ LAST = 0.05  # of the learning rates, in the end; they fall over the second half
 SHAPE_WEIGHT = 0.1  # of changes of scales and quaternions, which the tracks do not know
 HIDDEN = 0.1  # weight of the places of what is faded, which would else wander before the cameras
 SHEET_STIFF = 10.0  # times as much, of the scales of tracks that fade
-FADED, FADE_WEIGHT = 7.0, 0.03  # logits by which what is not seen loses opacity; weight of the distance from that
+FADED, FADE_WEIGHT = 7.0, 0.12  # logits by which what is not seen loses opacity; weight of the distance from that
+SHEET_DYNAMICS = 2.0  # of the dynamics attributes of sheets: of all of them, and of the last one's time
 HINGES = 3.0  # of the decoder's units, whose inputs are of the size 1: how much they change over the clip
+STEEP = 0.5  # of those about a sheet's own time, times the number of sheets
 WITHIN, BEYOND = 0.5, 0.3  # of the way to another point of its body, on which a step asks for one; and away from it
 LIGHT_WEIGHT = 0.03  # of the light on bodies
 SOFTENING = 1e-2  # world units; distances below count as squares
@@ -55,7 +57,7 @@ def fit_field(
     if not groups:
         return None
     if fades and isinstance(field, GridField) and field.config.dynamics_size > 1 and field.config.temporal_hash:
-        _tell_times(field, generator)
+        _tell_times(field, tracks.parts, generator)
     optimizer = torch.optim.Adam([{"params": each, "rate": rate} for rate, each in groups], eps=ADAM_EPS, fused=True)
     paths, supported = torch.from_numpy(tracks.paths), torch.from_numpy(tracks.supported)
     beside = torch.from_numpy(ndimage.maximum_filter1d(tracks.supported, 3, axis=0)).float()
@@ -141,7 +143,7 @@ def _sheets_loss(move: Deformation, far: Tensor, seen: Tensor, beside: Tensor) -
     loss = (weights * of_tracks).sum() / weights.sum() + of_still.mean() + _shape_loss(move, stiffness=SHEET_STIFF)
     if move.d_opacity is not None:
         of_tracks, of_still = move.d_opacity.split(sizes)
-        kinds = of_tracks[seen], of_tracks[~seen] + FADED, of_still
+        kinds = of_tracks[seen], (of_tracks[beside == 0] + FADED).clamp(min=0), of_still
         loss = loss + FADE_WEIGHT * sum(each.abs().mean() for each in kinds if len(each))
     return loss
 
@@ -166,17 +168,21 @@ def _bodies(scene: Scene4D, tracks: Tracks, light: Mapping[int, Floats]) -> tupl
     return first, count, shades
 
 
-def _tell_times(field: GridField, generator: torch.Generator) -> None:
+def _tell_times(field: GridField, parts: int, generator: torch.Generator) -> None:
     """Have the decoder's units begin as hinges in time and in the time of a sheet's code (`discover`): what
-    moves and fades one after another is made of these. Without a code, as what stands still is, all are zero."""
+    moves and fades one after another is made of these. Half of them lie about a sheet's own time, the steeper the more
+    parts there are. Without a code, as what stands still is, all are zero."""
     with torch.no_grad():
         for grid in field.grids[1:]:
             if grid.levels[0].dense:
                 x, y, t = grid.levels[0].resolution
                 grid.table[: x * y * t, 0] = torch.linspace(-1, 1, t).repeat_interleave(x * y)
         weight, size = field.temporal.weight, field.config.dynamics_size
-        weight[:, size] = HINGES * (2 * torch.rand(len(weight), generator=generator) - 1)
-        weight[:, 1] = torch.rand(len(weight), generator=generator) * 2 - 1
-        weight[:, 0] = (1 + 1 + HINGES) / 2
-        field.temporal.bias.fill_(-1 - HINGES)
+        slope, own, knot = 2 * torch.rand(3, len(weight), generator=generator) - 1
+        steep, half = torch.full((len(weight),), HINGES), len(weight) // 2
+        steep[:half], slope[:half] = STEEP * parts, slope[:half].sign()
+        own[:half], knot[half:] = -steep[:half] * slope[:half] / SHEET_DYNAMICS, 1
+        weight[:, size], weight[:, 1] = steep * slope / field.config.time_scale, own
+        weight[:, 0] = (1 + steep + knot) / SHEET_DYNAMICS
+        field.temporal.bias.copy_(-1 - steep)
         field.spatial.bias.fill_(2.0)  # the gate lets 0.76 through

@@ -21,7 +21,7 @@ from lapgs_wgpu.prepare.calibration import match_names, read_calibration
 from lapgs_wgpu.prepare.diagnosis import MASKS
 from lapgs_wgpu.prepare.film import Film, Picture, extract, images_per_second
 from lapgs_wgpu.prepare.inputs import open_inputs
-from lapgs_wgpu.prepare.movers import RIM, Judged, Motion, cut_out, film_frames, judge, read_masks, write_masks
+from lapgs_wgpu.prepare.movers import RIM, Judged, Motion, cut_out, judge, read_masks, write_masks
 from lapgs_wgpu.prepare.poses import Reconstruction, RefusedError, import_cv2, import_pycolmap, neighbouring_pairs
 from lapgs_wgpu.prepare.report import REPORT
 from lapgs_wgpu.prepare.rig import place_calibrated, place_still
@@ -151,7 +151,7 @@ def _moving_camera(
     if known:
         say(f"{poses}: {len(found.placed)} of {len(names)} images have cameras, {found.error:.2f} pixels off (mean).")
     if moving is None:
-        motion = Motion(film_frames(film, pictures), names)
+        motion = Motion.of_film(film, pictures)
         if known:
             seen = judge(motion, found.model)
         else:

@@ -32,7 +32,7 @@ from lapgs_wgpu.progress import counted, say
 
 FRAMES_PER_SECOND = 10.0  # of one moving camera: poses change slowly
 STILL_FRAMES_PER_SECOND = 30.0  # of cameras on tripods, which need one pose for all their frames
-LEAST_IMAGES = 60  # of one moving camera, where the film has so many frames
+LEAST_IMAGES = 120  # of one moving camera, where the film has so many frames
 MOST_IMAGES = 300  # of a film, unless --fps asks for more
 LONGER_SIDE = 1920  # pixels: larger frames are shrunk
 BLACK = 6.0  # levels of 255: the mean of a black image

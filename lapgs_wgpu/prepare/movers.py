@@ -24,7 +24,7 @@ from lapgs_wgpu.progress import Progress
 
 SIDE = 480  # longer side of the images that are followed, pixels
 STEP = 4  # pixels between the places that are followed
-REACH = 6  # images, to either side
+REACH, LEAST_REACH, MOST_REACH = 0.5, 6, 12  # seconds to either side; images, at least and at most
 MEET, MEET_SHARE = 1.5, 0.05  # pixels between a place and its way forth and back, and more by this share of the way
 NOISE, NOISE_GROWS = 0.15, 0.05  # pixels of flow, at least: between neighbouring images; for each further one
 MOST = 30.0  # times the noise: larger errors are equal
@@ -43,13 +43,14 @@ class Motion:
     grid: (rows, columns, 2) the places of an image that are followed, pixels. tracks: of each image, where its grid is
     in the images around it, by their offsets; NaN where it is lost."""
 
-    def __init__(self, frames: Iterable[tuple[Pixels, bool]], names: Sequence[str]) -> None:
-        """frames: small images of equal size in order, the first being a picture, and whether each is one."""
+    def __init__(self, frames: Iterable[tuple[Pixels, bool]], names: Sequence[str], reach: int = LEAST_REACH) -> None:
+        """frames: small images of equal size in order, the first being a picture, and whether each is one. reach: the
+        images to either side in which one is followed."""
         cv2 = import_cv2()
         dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         dis.setFinestScale(1)
         following = iter(frames)
-        self.names, self.images = names, [next(following)[0]]
+        self.names, self.images, self.reach = names, [next(following)[0]], reach
         height, width = self.images[0].shape[:2]
         pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
         before = cv2.cvtColor(self.images[0], cv2.COLOR_RGB2GRAY)
@@ -72,9 +73,17 @@ class Motion:
         self.grid: Plane = np.stack(places, axis=-1).astype(np.float32)
         back = [flow[::-1] for flow in flows]
         self.tracks = [
-            self._ways(flows[i : i + REACH], 1) | self._ways(back[max(i - REACH, 0) : i][::-1], -1)
+            self._ways(flows[i : i + reach], 1) | self._ways(back[max(i - reach, 0) : i][::-1], -1)
             for i in range(len(self.images))
         ]
+
+    @classmethod
+    def of_film(cls, film: Film, pictures: Sequence[Picture]) -> "Motion":
+        """The flow of a film, from the first to the last of its pictures."""
+        seconds = pictures[-1].seconds - pictures[0].seconds
+        reach = round(REACH * (len(pictures) - 1) / max(seconds, 1e-3))
+        reach = min(max(reach, LEAST_REACH), MOST_REACH)
+        return cls(_film_frames(film, pictures), [picture.name for picture in pictures], reach)
 
     def _ways(self, flows: Sequence[Sequence[NDArray[np.float16]]], way: int) -> dict[int, Plane]:
         """The grid in images 1, 2, ... times `way` away. flows: from each of these to the next one, and back."""
@@ -94,7 +103,7 @@ def _at(values: Plane, at: NDArray[np.floating]) -> Plane:
     return cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(np.nan,) * 4)
 
 
-def film_frames(film: Film, pictures: Sequence[Picture]) -> Iterator[tuple[Pixels, bool]]:
+def _film_frames(film: Film, pictures: Sequence[Picture]) -> Iterator[tuple[Pixels, bool]]:
     """Small frames of a film from its first picture to its last, at most 4 steps from one to the next."""
     times = [picture.seconds for picture in pictures]
     number, last = 0, 0.0
@@ -189,10 +198,10 @@ class _Solved:
         return total, dict(zip(tracks, each, strict=True))
 
     def noise(self) -> NDArray[np.floating]:
-        """(REACH + 1,) pixels, by how many images apart."""
-        noise, count = NOISE + NOISE_GROWS * np.arange(REACH + 1), len(self._motion.names)
+        """(reach + 1,) pixels, by how many images apart."""
+        noise, count = NOISE + NOISE_GROWS * np.arange(self._motion.reach + 1), len(self._motion.names)
         sampled = [self.misses(i, noise)[1] for i in range(0, count, max(1, count // 12))]
-        for apart in range(1, REACH + 1):
+        for apart in range(1, len(noise)):
             errors = np.array([error for each in sampled for k, error in each.items() if abs(k) == apart])
             if len(known := errors[np.isfinite(errors)]):
                 noise[apart] *= max(1.0, 1.55 * np.percentile(known, 25))  # the median, if all were noise
@@ -239,11 +248,11 @@ def depth_errors(ray: Floats, seen: Floats, relative: Floats, sigma: Floats, mos
 
 
 def _votes(motion: Motion, errors: Plane) -> Plane:
-    """The mean logarithm of the errors along each place's way through up to 4 images to either side, the nearer ones
-    with more weight."""
+    """The mean logarithm of the errors along each place's way through two thirds of the images around it, the nearer
+    ones with more weight."""
     logs, result = np.log(np.maximum(errors, 0.5)), []
     for i, own in enumerate(logs):
-        near = {k: (at - STEP // 2) / STEP for k, at in motion.tracks[i].items() if abs(k) <= 4}
+        near = {k: (at - STEP // 2) / STEP for k, at in motion.tracks[i].items() if abs(k) <= 2 * motion.reach // 3}
         ways = {0: own} | {k: _at(logs[i + k], at) for k, at in near.items()}
         votes = np.stack(list(ways.values()))
         weight = np.isfinite(votes) / (1.0 + np.abs(list(ways)))[:, None, None]
