@@ -1,8 +1,8 @@
 """Tracks of what masks say moves in the images of one camera: cut-outs of some images, followed through the others.
 
 A cut-out is what is connected in the mask of one image and not mostly explained by earlier ones. It is followed from
-image to image by an affine map of its colors (Baker and Matthews, Lucas-Kanade 20 years on, IJCV 2004), until it no
-longer looks alike. It stands upright at the depth of the ground below it. Images show those of the nearest ones alone.
+image to image by its colors (Baker and Matthews, Lucas-Kanade 20 years on, IJCV 2004), affinely and with bends, until
+it no longer looks alike. It stands upright at the depth of the ground below. Images show those of the nearest ones.
 """
 
 from collections.abc import Sequence
@@ -194,11 +194,8 @@ def _registered(source: list[Floats], target: list[Floats], sheet: _Sheet, start
             difference = sampled[:, :4] - wanted
             size = np.sqrt(np.square(difference[:, :3]).sum(axis=1))
             weight = (inside / (1 + np.square(size / ALIKE))).astype(np.float32)
-            J = (
-                (sampled[:, 4:].reshape(-1, 2, 4, 1) * basis[:, None, None])
-                .transpose(0, 2, 1, 3)
-                .reshape(-1, 2 * count)
-            )
+            slopes = sampled[:, 4:].reshape(-1, 2, 4).transpose(0, 2, 1)
+            J = (slopes[..., None] * basis[:, None, None]).reshape(-1, 2 * count)
             weighted = J * np.repeat(weight, 4)[:, None]
             H = (weighted.T @ J).astype(np.float64)
             scale = np.trace(H) / len(H)
@@ -265,9 +262,7 @@ def _depths(mask: Mask, depth: Floats) -> Floats:
 def _placed(cutout: _Cutout, images: Sequence[Residual], depths: Sequence[Floats], most: int) -> tuple[Floats, Floats]:
     """The paths (T, n, 3) and colors (n, 3) of a cut-out, of so many points at most."""
     picked = evenly_indices(len(cutout.pixels), most)
-    chosen = cutout.pixels[picked]
-    x, y = chosen.T
-    at = cutout.at[:, picked].transpose(0, 2, 1)
+    (x, y), at = cutout.pixels[picked].T, cutout.at[:, picked].transpose(0, 2, 1)
     height, width = depths[0].shape
     seen = np.flatnonzero(cutout.seen).tolist()
     inverse: dict[int, float] = {}
@@ -280,7 +275,7 @@ def _placed(cutout: _Cutout, images: Sequence[Residual], depths: Sequence[Floats
     if inverse:  # nearly a line over a few times
         filled = np.interp(np.arange(len(images)), list(inverse), list(inverse.values()))
         depth = 1 / ndimage.gaussian_filter1d(ndimage.median_filter(filled, 9, mode="nearest"), 3.0, mode="nearest")
-    paths = np.zeros((len(images), len(chosen), 3), np.float32)
+    paths = np.zeros((len(images), len(picked), 3), np.float32)
     for t in seen:
         paths[t] = points_at(images[t].camera, at[t].T + 0.5, depth[t : t + 1])
     return paths, images[cutout.key].image[y, x].astype(np.float32)
