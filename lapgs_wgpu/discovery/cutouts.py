@@ -29,7 +29,7 @@ LOST, VISIBLE = 0.65, 0.3  # shares of a cut-out that must look alike, and lie i
 COMPARED = 1500  # pixels of a cut-out
 NEAR = 2.0  # pixels, from one of a cut-out: it explains a pixel
 KNOTS = 8  # pixels, about, between two at which a cut-out bends
-TENSION, AFFINE = 0.05, 0.05  # weights of how bends differ from knot to knot; of bends alike, which the map is for
+TENSION = 0.05  # weight of how bends differ from knot to knot
 STIFF = 0.02  # weight of a change from one image to the next
 FOOT = 0.15  # of its height: the lowest part of a cut-out, which stands on the ground
 HIDDEN, BEFORE = 0.1, 0.9  # quantile of the depths of what a cut-out hides; how far before that and the ground it is
@@ -147,10 +147,7 @@ def _followed(levels: Sequence[list[Floats]], masks: Mask, key: int, pixels: NDA
     for way in (-1, 1):
         before = step = np.zeros((sheet.basis.shape[1], 2))
         for t in range(key + way, len(masks) if way > 0 else -1, way):
-            found, alike = max(
-                (_registered(levels[key], levels[t], sheet, start) for start in (before + step, before)),
-                key=lambda each: each[1],
-            )
+            found, alike = _registered(levels[key], levels[t], sheet, before + step)
             if alike < LOST:
                 break
             at[t], seen[t] = pixels + sheet.basis @ found, True
@@ -176,16 +173,16 @@ class _Sheet:
         beside = np.kron(steps[0].T @ steps[0], np.eye(len(knots[1])))
         beside += np.kron(np.eye(len(knots[0])), steps[1].T @ steps[1])
         self.tension = np.zeros((self.basis.shape[1], self.basis.shape[1]))
-        self.tension[3:, 3:] = TENSION * (beside + AFFINE * np.eye(len(beside)))
+        self.tension[3:, 3:] = TENSION * beside
 
 
-def _registered(source: list[Floats], target: list[Floats], sheet: _Sheet, start: Weights) -> tuple[Weights, float]:
-    """How a cut-out goes to another image, near `start`, and the share of its pixels that look alike there."""
+def _registered(source: list[Floats], target: list[Floats], sheet: _Sheet, weights: Weights) -> tuple[Weights, float]:
+    """How a cut-out goes to another image, near `weights`, and the share of its pixels that look alike there."""
     x, y = sheet.pixels.T
     height, width = source[0].shape[:2]
-    weights = start.copy()
+    weights = weights.copy()
     for blur, there, here in zip(BLURS, target, source, strict=True):
-        wanted, count = here[y, x, :4], 3 if blur == BLURS[0] else len(start)
+        wanted, count = here[y, x, :4], 3 if blur == BLURS[0] else len(weights)
         basis, tension = sheet.compared[:, :count], sheet.tension[:count, :count]
         for _ in range(8):
             at = (sheet.pixels + sheet.compared @ weights).T
