@@ -132,7 +132,7 @@ def test_a_long_film_gives_fewer_images_a_second(tmp_path: Path) -> None:
     short.seconds, long.seconds = 5.0, 60.0
     assert images_per_second([long], None) == 5
     assert images_per_second([long], 12) == 12
-    assert images_per_second([short], None) == 10
+    assert images_per_second([short], None) == 15
     assert images_per_second([short, long], None) == 30
     short.seconds = 12.0
     assert images_per_second([short, long], None) == 25
