@@ -141,51 +141,51 @@ def _levels(residual: Residual) -> list[Floats]:
 
 def _followed(levels: Sequence[list[Floats]], masks: Mask, key: int, pixels: NDArray[np.int64]) -> _Cutout:
     """Follow a cut-out to both ends of the clip."""
-    sheet, at = _Sheet(pixels), np.tile(pixels.astype(np.float32), (len(masks), 1, 1))
+    warp, at = _Warp(pixels), np.tile(pixels.astype(np.float32), (len(masks), 1, 1))
     seen, explained = np.zeros(len(masks), bool), np.zeros_like(masks)
     seen[key] = explained[key, pixels[:, 1], pixels[:, 0]] = True
     for way in (-1, 1):
-        before = step = np.zeros((sheet.basis.shape[1], 2))
+        before = step = np.zeros((warp.basis.shape[1], 2))
         for t in range(key + way, len(masks) if way > 0 else -1, way):
-            found, alike = _registered(levels[key], levels[t], sheet, before + step)
+            found, alike = _registered(levels[key], levels[t], warp, before + step)
             if alike < LOST:
                 break
-            at[t], seen[t] = pixels + sheet.basis @ found, True
+            at[t], seen[t] = pixels + warp.basis @ found, True
             step, before = found - before, found
             explained[t] = _explained(levels[key], levels[t], masks[t], pixels, at[t])
     return _Cutout(key, pixels, at, seen, explained)
 
 
-class _Sheet:
+class _Warp:
     """How the pixels (n, 2) of a cut-out may go: basis (n, 3 + k) @ weights (3 + k, 2) is how far, by an affine map and
     by bends at k knots. tension: (3 + k, 3 + k), what bends cost that differ from those at the knots beside them."""
 
     def __init__(self, pixels: NDArray[np.int64]) -> None:
-        self.pixels = pixels[evenly_indices(len(pixels), COMPARED)]
+        chosen = evenly_indices(len(pixels), COMPARED)
+        self.pixels = pixels[chosen]
         middle, scale = self.pixels.mean(axis=0), max(float(self.pixels.std()), 1.0)
         inside = pixels - pixels.min(axis=0)
         knots = [np.linspace(0, most, max(2, 1 + round(most / KNOTS))) for most in np.maximum(inside.max(axis=0), 1)]
         across, down = (np.maximum(0, 1 - np.abs(inside[:, i, None] - at) / at[1]) for i, at in enumerate(knots))
         bends = (across[:, :, None] * down[:, None]).reshape(len(pixels), -1)
         self.basis = np.concatenate([(pixels - middle) / scale, np.ones((len(pixels), 1)), bends], axis=1)
-        self.compared = self.basis[evenly_indices(len(pixels), COMPARED)].astype(np.float32)
+        self.compared = self.basis[chosen].astype(np.float32)
         steps = [np.diff(np.eye(len(at)), axis=0) for at in knots]
         beside = np.kron(steps[0].T @ steps[0], np.eye(len(knots[1])))
         beside += np.kron(np.eye(len(knots[0])), steps[1].T @ steps[1])
-        self.tension = np.zeros((self.basis.shape[1], self.basis.shape[1]))
-        self.tension[3:, 3:] = TENSION * beside
+        self.tension = np.pad(TENSION * beside, ((3, 0), (3, 0)))
 
 
-def _registered(source: list[Floats], target: list[Floats], sheet: _Sheet, weights: Weights) -> tuple[Weights, float]:
+def _registered(source: list[Floats], target: list[Floats], warp: _Warp, weights: Weights) -> tuple[Weights, float]:
     """How a cut-out goes to another image, near `weights`, and the share of its pixels that look alike there."""
-    x, y = sheet.pixels.T
+    x, y = warp.pixels.T
     height, width = source[0].shape[:2]
     weights = weights.copy()
     for blur, there, here in zip(BLURS, target, source, strict=True):
         wanted, count = here[y, x, :4], 3 if blur == BLURS[0] else len(weights)
-        basis, tension = sheet.compared[:, :count], sheet.tension[:count, :count]
+        basis, tension = warp.compared[:, :count], warp.tension[:count, :count]
         for _ in range(8):
-            at = (sheet.pixels + sheet.compared @ weights).T
+            at = (warp.pixels + warp.compared @ weights).T
             inside = (at >= 0).all(axis=0) & (at[0] <= width - 1) & (at[1] <= height - 1)
             sampled = _sampled(there, at)
             difference = sampled[:, :4] - wanted
