@@ -6,6 +6,7 @@ outside the annotated masks.
 """
 
 import dataclasses
+import json
 import sys
 import time
 from pathlib import Path
@@ -17,6 +18,7 @@ from lapgs_wgpu import load, open_device
 from lapgs_wgpu.data import load_dataset
 from lapgs_wgpu.data.images import encode_png
 from lapgs_wgpu.run import train
+from lapgs_wgpu.train.camera_refinement import corrected_views
 from lapgs_wgpu.train.evaluate import evaluate
 from lapgs_wgpu.train.plan import scale_schedule
 from lapgs_wgpu.train.presets import load_config
@@ -52,7 +54,9 @@ def main(davis: Path, captures: Path, steps: int, films: list[str]) -> None:
         true = write_true_masks(davis / "Annotations/480p" / film, capture)
         found, given = (load_dataset(capture, image_size=config.data.size, movers=masks) for masks in ("masks", true))
         pairs = zip(found.test, given.test, strict=True)  # the world's coordinates follow the masks that were found
-        m = evaluate(scene, [dataclasses.replace(view, moving=other.moving) for view, other in pairs], "black")
+        measured = json.loads((run / "metrics.json").read_text())["training"].get("cameras", {})
+        views = [dataclasses.replace(view, moving=other.moving) for view, other in pairs]
+        m = evaluate(scene, corrected_views(views, measured.get("test_views", {})), "black")
         print(
             f"| {name} | {m['psnr']:.2f} | {m['ssim']:.3f} | {m['psnr_moving']:.2f} | {m['psnr_still']:.2f} | "
             f"{m['explained']:.0%} | {m['gaussians']:,} | {seconds:.0f} |",

@@ -22,6 +22,7 @@ from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.scene import Scene4D
 from lapgs_wgpu.progress import say
 from lapgs_wgpu.train import run_folder
+from lapgs_wgpu.train.camera_refinement import corrected_views, held_out_corrections
 from lapgs_wgpu.train.config import Config
 from lapgs_wgpu.train.evaluate import Lpips, evaluate, write_metrics
 from lapgs_wgpu.train.host import keep_freed_memory, return_freed_memory
@@ -156,6 +157,8 @@ def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None)
             if refinement is not None:
                 measured[name] = refinement.report()
                 log.note(refinement.summary.format(**measured[name]))
+        if training.cameras is not None and (corrections := held_out_corrections(training.cameras, training.dataset)):
+            measured["cameras"]["test_views"] = corrections
 
     return_freed_memory()
     run_folder.save_state(out, training.state())
@@ -246,10 +249,11 @@ def evaluate_run(
     out: Path, scene: Scene4D, dataset: Dataset, background: str, training: dict[str, Any], lpips: Lpips | None = None
 ) -> None:
     """Evaluate on the test views (`evaluate`); write metrics.json and eval/ of a run folder. training: goes into
-    metrics.json as it is."""
+    metrics.json as it is; `cameras.test_views`, if there, corrects the views' cameras."""
     folder = out / "eval"
     if folder.is_symlink():
         raise InputError(f"{folder} is a link, and images are written into the run's own folder only; remove it.")
     folder.mkdir(exist_ok=True)
-    metrics = evaluate(scene, dataset.test, background, folder, lpips=lpips)
+    views = corrected_views(dataset.test, training.get("cameras", {}).get("test_views", {}))
+    metrics = evaluate(scene, views, background, folder, lpips=lpips)
     write_metrics(out, {**metrics, "training": training})

@@ -14,8 +14,10 @@ from scipy.spatial.transform import Rotation
 from view_alignment import aligned_view
 
 from lapgs_wgpu.data import Dataset
+from lapgs_wgpu.data.views import View
 from lapgs_wgpu.discovery.discover import start_training
 from lapgs_wgpu.discovery.static_fit import static_config
+from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.splat.camera import Camera
@@ -26,6 +28,8 @@ from lapgs_wgpu.train.camera_refinement import (
     CameraRefinement,
     ScenePoints,
     changed_camera,
+    corrected_views,
+    held_out_corrections,
     image_motion,
     whitening,
 )
@@ -203,6 +207,31 @@ def test_test_time_alignment_finds_the_camera(refined_walk: tuple[Trainer, list[
         assert turn < 0.5 * before
     again = aligned_view(training.scene, moved[0], torch.zeros(3), extent).camera
     assert np.array_equal(again.T_cam_world, near[0].camera.T_cam_world)
+
+
+def test_held_out_cameras_are_corrected_as_those_around_them(dataset: Dataset) -> None:
+    given = cameras(5)
+    turns = {camera: np.array([0.01, 0, -0.02, 0.1, 0.2, 0]) * i for i, camera in enumerate(given)}
+    refinement = CameraRefinement(given, 2.0, CONFIG, lambda: POINTS, turns)
+    shown = dataset.train[0]
+
+    def view(name: str, time: float, camera: Camera) -> View:
+        return dataclasses.replace(shown, name=name, time=time, camera=camera)
+
+    train = [view(f"train_{i}", i / 4, camera) for i, camera in enumerate(given)]
+    test = view("test_0", 0.3, given[0])
+    data = dataclasses.replace(dataset, train=(*train[::2], *train[1::2]), test=(test,))
+    corrections = held_out_corrections(refinement, data)
+    np.testing.assert_allclose(corrections["test_0"], 1.2 * turns[given[1]], atol=1e-12)
+    (corrected,) = corrected_views([test], corrections)
+    np.testing.assert_array_equal(
+        corrected.camera.T_cam_world, changed_camera(given[0], 1.2 * turns[given[1]]).T_cam_world
+    )
+    assert corrected_views(train, corrections) == train
+    rig = dataclasses.replace(data, train=(*train, view("train_5", 0.5, given[0])))
+    assert held_out_corrections(refinement, rig) == {}
+    with pytest.raises(InputError, match="test_0 is not made of 6 numbers"):
+        corrected_views([test], {"test_0": [1.0, "x"]})
 
 
 @pytest.mark.parametrize(("refine", "own", "refined"), [("auto", True, True), ("auto", False, False),

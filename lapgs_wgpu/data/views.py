@@ -119,6 +119,11 @@ class Dataset:
         """Whether several cameras stand still: each keeps its own colors."""
         return len(self.cameras) > 1 and self.still_cameras
 
+    @property
+    def is_film(self) -> bool:
+        """Whether one camera moves and shows each time once."""
+        return len(self.train) == len(self.cameras) == len(self.times)
+
     @cached_property
     def is_surrounded(self) -> bool:
         """Whether still cameras stand all around what they look at, AROUND of them or more at each time."""

@@ -3,16 +3,18 @@
 Poses of own footage come from structure from motion and are a little off, which a training answers with blur. The
 gradient is that of the rasterizer's backward pass (`camera_bwd`); the steps move each image alike (`CameraDescent`).
 What all cameras could do together without any image changing (shift, turn and scale of the whole scene) is taken out,
-and corrections are pulled back to zero. Views that are measured keep their cameras.
+and corrections are pulled back to zero.
 
 A small turn of a camera and a small shift of it look nearly the same; only parallax tells them apart. The matrix J^T J
 of the image motion, over points of the scene, says how much each change is seen, and its inverse root whitens the
 gradient (CamP, Park et al. 2023).
+
+A view of a film that is held out is corrected as the images before and after it are: none of its own pixels is asked.
 """
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -20,6 +22,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
+from lapgs_wgpu.data.views import Dataset, View
+from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.config import CamerasConfig
 from lapgs_wgpu.train.optimizer import rate_at
@@ -208,6 +212,37 @@ def changed_camera(camera: Camera, change: Array) -> Camera:
     T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec(change[:3]).as_matrix().T
     T[:3, 3] = -T[:3, :3] @ (camera.position + change[3:])
     return dataclasses.replace(camera, T_cam_world=T)
+
+
+def held_out_corrections(refinement: CameraRefinement, dataset: Dataset) -> dict[str, list[float]]:
+    """Of each test view of a film, by its name, what its camera is corrected by (`changed_camera`): in time between the
+    corrections of the training views around it. Empty for other captures."""
+    if not dataset.is_film:
+        return {}
+    views = sorted(dataset.train, key=lambda view: view.time)
+    times, corrections = [view.time for view in views], [refinement.correction(view.camera) for view in views]
+    return {
+        view.name: [float(np.interp(view.time, times, values)) for values in np.transpose(corrections)]
+        for view in dataset.test
+    }
+
+
+def corrected_views(views: Sequence[View], corrections: Mapping[str, Any]) -> list[View]:
+    """Views with corrected cameras, where `held_out_corrections` names them. Raises InputError."""
+    return [
+        view if view.name not in corrections else dataclasses.replace(view, camera=_corrected(view, corrections))
+        for view in views
+    ]
+
+
+def _corrected(view: View, corrections: Mapping[str, Any]) -> Camera:
+    try:
+        change = np.array(corrections[view.name], np.float64)
+    except (TypeError, ValueError):
+        change = np.array(np.nan)
+    if change.shape != (6,) or not np.isfinite(change).all():
+        raise InputError(f"metrics.json: training.cameras.test_views.{view.name} is not made of 6 numbers.")
+    return changed_camera(view.camera, change)
 
 
 def _common_motions(cameras: Sequence[Camera], extent: float) -> Array:
