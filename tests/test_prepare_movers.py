@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers.films import Board, drawn, pose_errors, walk, write_film
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from lapgs_wgpu.data.images import encode_png
 from lapgs_wgpu.errors import InputError
@@ -140,6 +141,22 @@ def test_a_camera_that_turns_needs_no_depth() -> None:
     total, _ = depth_errors(ray, np.stack(seen), poses, np.full(3, 5e-4), 1.0)
     assert total[:20].max() < 1e-3
     assert total[20:].min() > 5
+
+
+def test_errors_that_change_evenly_over_an_image_are_left_out() -> None:
+    """Of cameras that are 0.5 degrees off, the farther the more, and a quarter of the places moves by itself."""
+    cameras, points = walk(12, 320, 240)[:5], np.random.default_rng(3).uniform(-0.8, 0.8, (800, 3))
+    moves = points[:, 0] > 0.4
+    lift = 0.05 * np.where(moves, 1, 0) * np.arange(5)[:, None]
+    seen, sigma = seen_by(cameras, points + lift[..., None] * [0, 0, 1]), np.full(4, 2e-4)
+    poses = relative(cameras)
+    for i, pose in enumerate(poses, start=1):
+        pose[:3] = Rotation.from_rotvec(np.radians([0.1, 0.0, 0.5]) * i / 4).as_matrix() @ pose[:3]
+    rough = depth_errors(seen[0], seen[1:], poses, sigma, 1.0)[0]
+    even = depth_errors(seen[0], seen[1:], poses, sigma, 1.0, even=True)[0]
+    assert np.median(rough[~moves]) > 3
+    assert np.median(even[~moves]) < 1
+    assert even[moves].min() > 5
 
 
 def test_places_are_followed_and_lost() -> None:

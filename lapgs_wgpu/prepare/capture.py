@@ -21,7 +21,7 @@ from lapgs_wgpu.prepare.calibration import match_names, read_calibration
 from lapgs_wgpu.prepare.diagnosis import MASKS
 from lapgs_wgpu.prepare.film import Film, Picture, extract, images_per_second
 from lapgs_wgpu.prepare.inputs import open_inputs
-from lapgs_wgpu.prepare.movers import RIM, Judged, Motion, cut_out, judge, read_masks, write_masks
+from lapgs_wgpu.prepare.movers import RIM, Motion, cut_out, judge, read_masks, write_masks
 from lapgs_wgpu.prepare.poses import Reconstruction, RefusedError, import_cv2, import_pycolmap, neighbouring_pairs
 from lapgs_wgpu.prepare.report import REPORT
 from lapgs_wgpu.prepare.rig import place_calibrated, place_still
@@ -152,11 +152,8 @@ def _moving_camera(
         say(f"{poses}: {len(found.placed)} of {len(names)} images have cameras, {found.error:.2f} pixels off (mean).")
     if moving is None:
         motion = Motion.of_film(film, pictures)
-        if known:
-            seen = judge(motion, found.model)
-        else:
-            found, seen = _without_movers(source, found, motion)
-        moving = cut_out(motion, seen)
+        found = found if known else _without_movers(source, found, motion)
+        moving = cut_out(motion, judge(motion, found.model, even=True))
     write_masks(folder / MASKS, moving)
     if found.pan is not None:
         turns = "stands still" if found.pan.travel < 4e-3 * max(size) else "turns on the spot"
@@ -188,7 +185,7 @@ def _known(names: Sequence[str], poses: Path, size: Size) -> dict[str, tuple[Len
     return {name: (cameras[camera].lens_for(size), cameras[camera].T_cam_world) for name, camera in found.items()}
 
 
-def _without_movers(source: Reconstruction, found: Found, motion: Motion) -> tuple[Found, Judged]:
+def _without_movers(source: Reconstruction, found: Found, motion: Motion) -> Found:
     """Find what moves, and place the cameras again without it.
 
     A reconstruction follows whatever its features agree on most, which may be what moves, in all images or in some.
@@ -225,7 +222,7 @@ def _without_movers(source: Reconstruction, found: Found, motion: Motion) -> tup
             "does not fit their cameras, which may follow what moves: leave out that part of the film, or mask what "
             "moves (--masks)."
         )
-    return found, seen
+    return found
 
 
 def _refusal(source: Reconstruction, found: Found | None, folder: Path, pictures: Sequence[Picture]) -> RefusedError:
