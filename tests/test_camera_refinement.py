@@ -228,6 +228,10 @@ def test_held_out_cameras_are_corrected_as_those_around_them(dataset: Dataset) -
         corrected.camera.T_cam_world, changed_camera(given[0], 1.2 * turns[given[1]]).T_cam_world
     )
     assert corrected_views(train, corrections) == train
+    jumps = CameraRefinement(
+        given, 2.0, CONFIG, lambda: POINTS, {camera: turns[given[1]] * (-1) ** i for i, camera in enumerate(given)}
+    )
+    assert held_out_corrections(jumps, data) == {}
     rig = dataclasses.replace(data, train=(*train, view("train_5", 0.5, given[0])))
     assert held_out_corrections(refinement, rig) == {}
     with pytest.raises(InputError, match="test_0 is not made of 6 numbers"):

@@ -216,15 +216,16 @@ def changed_camera(camera: Camera, change: Array) -> Camera:
 
 def held_out_corrections(refinement: CameraRefinement, dataset: Dataset) -> dict[str, list[float]]:
     """Of each test view of a film, by its name, what its camera is corrected by (`changed_camera`): in time between the
-    corrections of the training views around it. Empty for other captures."""
-    if not dataset.is_film:
-        return {}
+    corrections of the training views around it. Empty for other captures, and where those do not foretell each other.
+    """
     views = sorted(dataset.train, key=lambda view: view.time)
-    times, corrections = [view.time for view in views], [refinement.correction(view.camera) for view in views]
-    return {
-        view.name: [float(np.interp(view.time, times, values)) for values in np.transpose(corrections)]
-        for view in dataset.test
-    }
+    if not dataset.is_film or len(views) < 3:
+        return {}
+    times, learnt = [view.time for view in views], np.stack([refinement.correction(view.camera) for view in views])
+    apart = learnt[1:-1] - (learnt[:-2] + learnt[2:]) / 2
+    if np.square(apart).sum() >= np.square(learnt[1:-1]).sum():
+        return {}
+    return {view.name: [float(np.interp(view.time, times, each)) for each in learnt.T] for view in dataset.test}
 
 
 def corrected_views(views: Sequence[View], corrections: Mapping[str, Any]) -> list[View]:
