@@ -37,6 +37,8 @@ LEAST = 0.002  # of an image that moves; less is noise
 SHARP = 2.5  # times the noise of the better of two reconstructions: it agrees
 RIM = np.pad(np.ones((42, 42), bool), 9)  # mask of all but an image's rim, which seldom shows what moves
 
+Values = NDArray[np.floating]
+
 
 class Motion:
     """The flow of a film. names: of its pictures. images: (h, w, 3) RGB, SIDE pixels at most, one of each picture.
@@ -243,7 +245,7 @@ def depth_errors(
 
 
 def _fitted_errors(
-    far: Floats, move: Floats, seen: Floats, known: Mask, sigma: Floats, most: float
+    far: Plane, move: Plane, seen: Values, known: Mask, sigma: Values, most: float
 ) -> tuple[Floats, Floats, Floats]:
     """The errors of `depth_errors`, and (k, n, 2) the last ones themselves."""
     a = move[..., :2] - seen * move[..., 2:]  # b + inverse depth * a = 0, up to depth
