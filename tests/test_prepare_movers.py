@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from lapgs_wgpu.data.images import encode_png
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.prepare.capture import prepare
-from lapgs_wgpu.prepare.movers import RIM, Judged, Motion, depth_errors, read_masks
+from lapgs_wgpu.prepare.depth_errors import depth_errors
+from lapgs_wgpu.prepare.movers import RIM, Judged, Motion, read_masks
 from lapgs_wgpu.prepare.poses import in_mask, without
 
 pycolmap = pytest.importorskip("pycolmap")
