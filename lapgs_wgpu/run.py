@@ -138,7 +138,8 @@ def _outside(scene: Scene4D) -> str:
 def _run(training: Trainer, out: Path, watch: Watch | None, lpips: Lpips | None) -> Scene4D:
     """The steps that are left, with all that a run folder receives."""
     config, scene = training.config, training.scene
-    log = Log(out / "log.jsonl", config.schedule.steps, done=training.done, before=training.discovery_seconds)
+    schedule, before = config.schedule, training.discovery_seconds
+    log = Log(out / "log.jsonl", schedule.steps, done=training.done, before=before, quick=schedule.half_size_steps)
     with log, stop_requests() as interrupted:
         if training.discovery is not None:
             log.discovered(training.discovery)

@@ -15,7 +15,6 @@ from lapgs_wgpu.motion.fields.config import FieldConfig
 EXAMPLES = Path(__file__).parents[1] / "examples"
 ARGUMENTS = {
     "train": ["--steps", "30"],
-    "growing_images": ["--steps", "60", "--until", "40", "--small", "16"],
     "own_field": ["--steps", "30"],
     "own_loss": ["--steps", "60"],
     "own_density": ["--steps", "230", "--budget", "4000"],
@@ -41,15 +40,6 @@ def test_train(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     metrics = run("train", data, tmp_path, monkeypatch)
     assert metrics["psnr"] > 10
     assert (tmp_path / "scene.ply").stat().st_size > 1e5
-
-
-@pytest.mark.nightly
-def test_growing_images(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    monkeypatch.setitem(ARGUMENTS, "growing_images", [*ARGUMENTS["growing_images"], "--out", "grown.ply"])
-    assert run("growing_images", data, tmp_path, monkeypatch) > 10
-    assert (tmp_path / "grown.ply").stat().st_size > 1e5
 
 
 def test_own_field(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:

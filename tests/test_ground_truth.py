@@ -57,6 +57,22 @@ def test_images_that_are_coming_are_decoded_once(device: Device) -> None:
     assert [source.decodes for source in sources] == [1, 1, 1]
 
 
+def test_images_of_half_the_size_and_their_cameras(device: Device) -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (20, 30, 3), np.uint8)
+    view = View("train_000", front_camera(30, 20), 0.0, "made up", lambda: pixels)
+    mean = np.floor(pixels.reshape(10, 2, 15, 2, 3).mean(axis=(1, 3)) + 0.5)
+    with closing(GroundTruth(device, ON_BLACK, 10_000)) as truth:
+        for halved, expected in ((False, pixels), (True, mean), (False, pixels)):
+            truth.halve(halved)
+            truth.prefetch([view])
+            for _ in range(2):
+                assert np.abs(255 * truth.on_host(view).image.numpy() - expected).max() <= 1
+            camera = truth.camera(view.camera)
+            assert (camera.height, camera.width) == expected.shape[:2]
+            place = camera.project(np.array([[0.1, 0.2, 3.0]]))[0]
+            assert np.allclose(place * (2 if halved else 1), view.camera.project(np.array([[0.1, 0.2, 3.0]]))[0])
+
+
 def test_a_failure_is_raised_where_the_image_is_needed_and_not_kept(device: Device) -> None:
     broken = [True]
 

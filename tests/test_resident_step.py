@@ -49,6 +49,7 @@ KINDS = {
     "no temporal grids": {"field__temporal_hash": "false"},
     "corrections": {"cameras__refine": "on", "cameras__start": "1", "exposure__enabled": "true"},
     "backgrounds": {"data__vary_background": "true"},
+    "half size": {"schedule__half_size_steps": "7"},
 }
 
 
@@ -136,7 +137,7 @@ def test_gradients_are_those_of_torch(device: Device, dataset: Dataset, kind: st
             assert relative(mine[name], exact) < bound, name
 
 
-@pytest.mark.parametrize("kind", ["laplacian", "static", "corrections"])
+@pytest.mark.parametrize("kind", ["laplacian", "static", "corrections", "half size"])
 def test_steps_are_those_of_torch(device: Device, dataset: Dataset, data: Path, kind: str) -> None:
     """Without what each draws by itself, over steps with and without motion, density control and a rising degree."""
     given = {"points__count": "150", "smoothness__share": "0", "acceleration__weight": "0", **KINDS.get(kind, {})}

@@ -62,6 +62,7 @@ KINDS = [
     pytest.param({"method": "grid4d"}, marks=pytest.mark.nightly, id="grid4d"),
     pytest.param({"cameras__refine": "on", "cameras__start": "5", "exposure__enabled": "true"}, id="corrections"),
     pytest.param({"timing__refine": "true", "timing__start": "15", "timing__interval": "6"}, id="times"),
+    pytest.param({"schedule__half_size_steps": "23"}, id="half size"),
 ]
 
 

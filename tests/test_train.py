@@ -326,3 +326,12 @@ def test_log_lines_and_the_progress_line(tmp_path: Path) -> None:
         assert shown.endswith("\n")
         assert ("\r" in shown) == stream.isatty()
         assert "\x1b" not in shown  # older consoles of Windows show escape codes
+
+
+@pytest.mark.parametrize(("quick", "told"), [(30, "  0:00 left"), (31, "  more than 0:00 left")])
+def test_time_left_is_a_bound_while_steps_are_quick(quick: int, told: str, tmp_path: Path) -> None:
+    terminal = io.StringIO()
+    with Log(tmp_path / "log.jsonl", 30, quick=quick, terminal=terminal) as log:
+        for step in range(1, 31):
+            log.step(StepResult(step, 30, lambda: Measured(0.5, 20.0)), 1000)
+    assert terminal.getvalue().rstrip().endswith(told)

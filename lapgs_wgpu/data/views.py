@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.focus import directions, focus_of, spread
-from lapgs_wgpu.data.images import Size, shrink
+from lapgs_wgpu.data.images import Size, shrink, shrunk_size
 from lapgs_wgpu.data.masks import MOSTLY, as_pixels
 from lapgs_wgpu.data.normalize import BOX, Normalization
 from lapgs_wgpu.data.timestamps import time_step
@@ -167,11 +167,10 @@ def small_views(views: Sequence[View], size: int) -> list[View]:
     cameras: dict[Camera, Camera] = {}
 
     def shrunk(view: View) -> View:
-        width, height = view.camera.width, view.camera.height
-        scale = size / max(width, height)
-        if scale >= 1:
+        stored = view.camera.width, view.camera.height
+        small = shrunk_size(stored, size)
+        if small == stored:
             return view
-        small = max(1, round(scale * width)), max(1, round(scale * height))
         return dataclasses.replace(
             view,
             camera=cameras.setdefault(view.camera, view.camera.resized(*small)),

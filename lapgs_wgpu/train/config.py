@@ -70,6 +70,11 @@ class ScheduleConfig(Options):
     cool_down: float = option(
         "fraction of the steps, the last, over which the rates of Gaussians, hash and mlp fall to 0", 0.0, at_most=1
     )
+    half_size_steps: int = option("number of first steps that see images of half the size; 0: none", 0)
+
+    def halves(self, step: int) -> bool:
+        """Whether a step (counted from 1) sees images of half the size."""
+        return step <= self.half_size_steps
 
 
 @dataclass(frozen=True)

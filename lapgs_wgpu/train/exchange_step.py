@@ -157,7 +157,7 @@ class ExchangeStep:
             self._learners.step(step, scheduled.share)
             # After the optimizer's step, so that no gradient is lost with the rows that change.
             if scheduled.seen:
-                self._density.statistics.add(rendering.radii, d_means2d, view.camera)
+                self._density.statistics.add(rendering.radii, d_means2d, self._draws.truth.camera(view.camera))
         else:
             check_parameters(parameters)  # whose values a step cannot mend
             measured = measured._replace(skipped=Skipped(step, view.name, cause(measured.terms, gradients)))
@@ -189,7 +189,7 @@ class ExchangeStep:
         of_image = [(term, weight) for term, weight in weighted if not isinstance(term, Regularizer)]
         rendering = render_loss(
             now.gaussians,
-            learners.camera(view),
+            truth.camera(learners.camera(view)),
             truth.on_device(view),
             truth.backgrounds[view],
             weights,

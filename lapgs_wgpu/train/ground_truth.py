@@ -14,9 +14,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lapgs_wgpu.data.views import View, composite
+from lapgs_wgpu.data.images import Size, shrunk_size
+from lapgs_wgpu.data.views import View, composite, small_views
 from lapgs_wgpu.gpu.array import DeviceArray
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.train.config import BACKGROUND_LEVELS, DataConfig
 
 DECODERS = min(4, os.cpu_count() or 1)  # threads that decode images before they are needed
@@ -28,7 +30,8 @@ class GroundTruth:
     """The ground truth of training views. The most recently used images stay on the device.
 
     backgrounds: of each view (3,) in [0, 1], behind its rendering and its transparent pixels. max_bytes: of the images
-    that are kept on the device, 4 bytes a pixel. A larger image is returned, but not kept.
+    that are kept on the device, 4 bytes a pixel. A larger image is returned, but not kept. halved: whether images have
+    half their size.
     """
 
     def __init__(self, device: Device, backgrounds: Mapping[View, Tensor], max_bytes: int) -> None:
@@ -36,6 +39,17 @@ class GroundTruth:
         self._kept: dict[View, DeviceArray] = {}  # that used last at the end
         self._coming: dict[View, Future[NDArray[np.uint8]]] = {}
         self._threads = ThreadPoolExecutor(DECODERS, thread_name_prefix="decode")
+        self.halved = False
+
+    def halve(self, halved: bool) -> None:
+        """Give images of half the size from now on, or whole ones."""
+        self.halved = halved
+        self._coming.clear()
+        self._kept.clear()
+
+    def camera(self, camera: Camera) -> Camera:
+        """A camera at the size that its images have now."""
+        return camera.resized(*_half(camera)) if self.halved else camera
 
     @property
     def used_bytes(self) -> int:
@@ -45,7 +59,7 @@ class GroundTruth:
     def prefetch(self, views: Iterable[View]) -> None:
         """Decode the images that are needed next, in the background; `on_device` raises what goes wrong there."""
         self._coming = {
-            view: self._coming.get(view) or self._threads.submit(marked_pixels, view, self.backgrounds[view])
+            view: self._coming.get(view) or self._threads.submit(self._pixels, view, self.halved)
             for view in views
             if view not in self._kept
         }
@@ -55,7 +69,7 @@ class GroundTruth:
         array = self._kept.pop(view, None)
         if array is None:
             coming = self._coming.pop(view, None)
-            pixels = coming.result() if coming else marked_pixels(view, self.backgrounds[view])
+            pixels = coming.result() if coming else self._pixels(view, self.halved)
             array = upload_rgba(self._device, pixels)
         if array.buffer.nbytes <= self._max_bytes:
             while self.used_bytes + array.buffer.nbytes > self._max_bytes:
@@ -67,11 +81,20 @@ class GroundTruth:
         """The image of a view on the background. Raises InputError where it cannot be read."""
         return host_image(self.on_device(view).read())
 
+    def _pixels(self, view: View, halved: bool) -> NDArray[np.uint8]:
+        shown = small_views([view], max(_half(view.camera)))[0] if halved else view
+        return marked_pixels(shown, self.backgrounds[view])
+
     def close(self) -> None:
         """End the decoding, and forget all images: what follows a training needs the memory."""
         self._threads.shutdown(cancel_futures=True)
         self._coming.clear()
         self._kept.clear()
+
+
+def _half(camera: Camera) -> Size:
+    stored = camera.width, camera.height
+    return shrunk_size(stored, max(1, max(stored) // 2))
 
 
 def backgrounds_of(views: Sequence[View], config: DataConfig) -> dict[View, Tensor]:

@@ -24,14 +24,22 @@ class Log(Progress):
     of the training.
 
     path: of log.jsonl, which is written anew, or continued after the step `done`. before: seconds that the training
-    took before its first step. terminal: stderr where None.
+    took before its first step. quick: number of first steps that take less time than the others. terminal: stderr
+    where None.
     """
 
     def __init__(
-        self, path: Path, steps: int, *, done: int = 0, before: float = 0.0, terminal: TextIO | None = None
+        self,
+        path: Path,
+        steps: int,
+        *,
+        done: int = 0,
+        before: float = 0.0,
+        quick: int = 0,
+        terminal: TextIO | None = None,
     ) -> None:
         super().__init__(steps, "steps", terminal)
-        self._path = path
+        self._path, self._quick = path, quick
         self._file, so_far = _continued(path, done)
         self._recent: deque[StepResult] = deque(maxlen=INTERVAL)
         self._fresh: list[StepResult] = []  # that were not yet asked what they tell
@@ -94,6 +102,8 @@ class Log(Progress):
     def _progress_line(self, step: int, gaussians: int) -> str:
         psnr, rate = self._means()["psnr"], self._steps_per_second()
         left = duration((self._total - step) / rate) if len(self._times) > 1 or step == self._total else "?"
+        if step < self._quick:
+            left = f"more than {left}"
         return f"step {step}/{self._total}  {psnr:5.2f} dB  {gaussians} Gaussians  {rate:.1f} steps/s  {left} left"
 
     def discovered(self, summary: str) -> None:

@@ -60,6 +60,7 @@ def camera_layout(dataset: Dataset) -> str:
 def step_seconds(config: Config, dataset: Dataset, device: Device) -> float:
     """Time some steps of a training with `points.count` moving Gaussians: the mean, seconds. Writes nothing. Raises
     InputError and DeviceError."""
+    config = changed(config, {"schedule.half_size_steps": 0})
     with Trainer(config, dataset, device, scene=start_from_points(config, dataset, device).scene) as trainer:
         for count in (UNTIMED_STEPS, TIMED_STEPS):
             start = time.perf_counter()
@@ -118,6 +119,6 @@ def scale_schedule(config: Config, steps: int) -> Config:
     """The configuration with `steps` steps, and all its schedules as much shorter or longer."""
     factor = steps / config.schedule.steps
     scaled = {key: max(1, round(factor * operator.attrgetter(key)(config))) for key in LENGTHS}
-    return changed(
-        config, scaled | {"schedule.steps": steps, "smoothness.start": round(factor * config.smoothness.start)}
-    )
+    for key in ("schedule.half_size_steps", "smoothness.start"):
+        scaled[key] = round(factor * operator.attrgetter(key)(config))
+    return changed(config, scaled | {"schedule.steps": steps})

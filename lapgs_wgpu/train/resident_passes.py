@@ -13,6 +13,7 @@ from lapgs_wgpu.motion.fields.grid_field import GridField
 from lapgs_wgpu.motion.passes.activation_passes import ActivationPasses
 from lapgs_wgpu.motion.passes.grid_field_passes import Decoding, FieldArrays, GridFieldPasses
 from lapgs_wgpu.motion.passes.samples import NO_SAMPLES, Samples
+from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.drawing import Drawing, GaussianGradients
 from lapgs_wgpu.splat.gaussians import Gaussians
 from lapgs_wgpu.splat.rasterize import rasterizer_of
@@ -32,16 +33,17 @@ _DYNAMICS_GROUPS, _MOST_COLUMNS = 64, 256  # common/dynamics.wgsl
 class Task:
     """A resident step.
 
-    scheduled: what the schedule says. before: where the draws stood before its view. view: of the training. time: of
-    the field. sh_degree: of the harmonics in use. rates: of the optimizer's groups, and of FREQUENCIES. near,
-    near_time: the places and the time that the smoothness loss compares; none in steps without it. even, even_times:
-    those of the acceleration loss. Once it was submitted: counts, how many steps had moved each tensor before; drawing;
-    later, what it tells; once it is settled: measured.
+    scheduled: what the schedule says. before: where the draws stood before its view. view: of the training. camera: the
+    view's, at the size that its image has. time: of the field. sh_degree: of the harmonics in use. rates: of the
+    optimizer's groups, and of FREQUENCIES. near, near_time: the places and the time that the smoothness loss compares;
+    none in steps without it. even, even_times: those of the acceleration loss. Once it was submitted: counts, how many
+    steps had moved each tensor before; drawing; later, what it tells; once it is settled: measured.
     """
 
     scheduled: Scheduled
     before: Mark
     view: View
+    camera: Camera
     time: float
     sh_degree: int
     rates: dict[str, float]
@@ -111,7 +113,7 @@ class ResidentPasses:
         self.parameters.begin(task.rates, moving=task.scheduled.moving)
         held = self._losses.held(truth)
         commands.copy(truth, held)
-        camera, plans = task.view.camera, self.rasterizer.plans
+        camera, plans = task.camera, self.rasterizer.plans
         plans.turn_to((camera.width, camera.height, True))
         # All that `_record` reads of the first step of a shape; the others replay what it recorded.
         kind = task.scheduled.moving, task.scheduled.seen, task.near.count > 0, task.even.count > 0, task.sh_degree
@@ -139,7 +141,7 @@ class ResidentPasses:
         if self._checked:
             return
         self._checked = True
-        camera = task.view.camera
+        camera = task.camera
         with Commands(self._device) as commands:
             drawn = self._activate(commands, task.sh_degree, None)
         d_image = self._losses.pool.array("d_image", (4, camera.height, camera.width))
@@ -156,7 +158,7 @@ class ResidentPasses:
         decodings = self._decode(commands, first, values)
         now = decodings[0] if decodings else None
         drawn = self._activate(commands, first.sh_degree, now)
-        drawing = self.rasterizer.record(commands, drawn, first.view.camera, self._background, corrections.move)
+        drawing = self.rasterizer.record(commands, drawn, first.camera, self._background, corrections.move)
         image = corrections.expose(commands, drawing.image)
         terms, d_image = self._losses.record(commands, image, truth, self._weights(first))
         d_image = corrections.expose_bwd(commands, drawing.image, d_image)
@@ -229,7 +231,7 @@ class ResidentPasses:
         for needed in drawing.needed:
             commands.dispatch(close, 1, guarded=guarded, needed=needed, bad=self._bad, guard=guard)
         if first.scheduled.seen:
-            kernel, camera = Kernel.get(self._device, "accumulate_statistics"), first.view.camera
+            kernel, camera = Kernel.get(self._device, "accumulate_statistics"), first.camera
             content = kernel.uniform("Seen", half_size=(camera.width / 2, camera.height / 2), gaussians=count)
             arrays = {"splats": drawing.splats, "d_splats": by_drawn.splats, "statistics": self.seen()}
             seen = self._pool.constant(content)

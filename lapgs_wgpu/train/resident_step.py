@@ -111,7 +111,8 @@ class ResidentStep:
         rates = learners.optimizer.rates_at(scheduled.step, scheduled.share)
         if learners.frequencies is not None:
             rates[FREQUENCIES] = rate_at(learners.frequencies.rate, scheduled.step)
-        task = Task(scheduled, before, view, self._scene.timing(view.time), self._scene.sh_degree, rates)
+        camera = self._draws.truth.camera(view.camera)
+        task = Task(scheduled, before, view, camera, self._scene.timing(view.time), self._scene.sh_degree, rates)
         near = even = 0
         if config.field.kind != "static":
             near, even = compared_counts(config, scheduled, count, times, fitted=learners.field_fitted > 0)

@@ -109,9 +109,8 @@ class Trainer:
         self._resident = None
         if config.step_place == "resident":
             self._resident = ResidentStep(*shared, self._roll_back_to, self._count_skipped)
-        self._plans, camera = rasterizer_of(scene.device).plans, dataset.train[0].camera
-        self._drawn = (camera.width, camera.height, True)  # the kind of images that the steps draw
-        self._plans.set_bands(self._drawn, 1)
+        self._plans = rasterizer_of(scene.device).plans
+        self._turn_to_images(config.schedule.halves(1))
         self.whole = True
 
     @property
@@ -131,6 +130,15 @@ class Trainer:
         chosen = "the device is a CPU" if self.scene.device.is_cpu else "step_place says so"
         reason = why_exchange(self.config, self.parts) or chosen
         return f"exchange: by torch, since {reason}"
+
+    def _turn_to_images(self, halved: bool) -> None:
+        """Have the next steps see images of half the size, or whole ones."""
+        if self._resident is not None:
+            self._resident.settle()
+        self._truth.halve(halved)
+        camera = self._truth.camera(self.dataset.train[0].camera)
+        self._drawn = (camera.width, camera.height, True)  # the kind of images that the steps draw
+        self._plans.set_bands(self._drawn, 1)
 
     def close(self) -> None:
         """End what goes on beside the steps."""
@@ -192,6 +200,8 @@ class Trainer:
         # Before this step draws: both may wait for steps in flight, which may draw again.
         if self._resident is not None:
             self._resident.settle(IN_FLIGHT - 1)
+        if self._truth.halved != self.config.schedule.halves(step):
+            self._turn_to_images(not self._truth.halved)
         timing, corrections = self.scene.timing, self.config.timing.corrections(self.config.schedule.steps)
         if self.timing is not None and moving and step in corrections:
             timing = self.timing.fitted(corrections.index(step))
@@ -239,7 +249,7 @@ class Trainer:
     def _picture(self, view: View, t: float) -> Tensor:
         """The scene's picture (H, W, 3) of a training view at a time of the field, with the corrections of its camera
         and of its colors."""
-        camera, correction = self._learners.camera(view), self.exposure_of(view)
+        camera, correction = self._truth.camera(self._learners.camera(view)), self.exposure_of(view)
         background = self._truth.backgrounds[view]
         image = self.scene.render_at_field_time(camera, t, background, depth=False).image
         return image if correction is None else image @ correction[:, :3].T + correction[:, 3]
@@ -297,4 +307,5 @@ class Trainer:
         self.warm_up_steps, self._ramp_steps = int(own["warm_up"]), int(own["rising"])
         self._learners.set_field_fitted(float(own["field_fitted"]))
         self._draws.go_back((own["random"], own["order"].tolist()))
+        self._turn_to_images(self.config.schedule.halves(max(1, self.done)))
         self._plans.set_bands(self._drawn, int(own["bands"]))
