@@ -359,7 +359,8 @@ def test_parts_of_several_cameras_may_bring_the_images_nearer_instead(device: De
 
 
 def test_the_static_fit_has_no_motion_and_small_images(dataset: Dataset) -> None:
-    config = static_config(configure())
+    config = static_config(configure(schedule__half_size_steps="20"))
+    assert not config.schedule.halves(1)
     assert (config.field.kind, config.schedule.steps, config.schedule.warm_up) == ("static", 60, 60)
     view, other = small_views(
         [dataset.train[0], dataclasses.replace(dataset.train[1], camera=dataset.train[0].camera)], 32

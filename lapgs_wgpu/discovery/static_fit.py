@@ -41,6 +41,7 @@ VALUES = {
     "density.split": "plain",
     "loss.pyramid": 0.0,
     "schedule.cool_down": 0.0,
+    "schedule.half_size_steps": 0,
     "step_place": "auto",
 }
 
