@@ -44,8 +44,7 @@ class GroundTruth:
     def halve(self, halved: bool) -> None:
         """Give images of half the size from now on, or whole ones."""
         self.halved = halved
-        self._coming.clear()
-        self._kept.clear()
+        self._forget()
 
     def camera(self, camera: Camera) -> Camera:
         """A camera at the size that its images have now."""
@@ -59,7 +58,7 @@ class GroundTruth:
     def prefetch(self, views: Iterable[View]) -> None:
         """Decode the images that are needed next, in the background; `on_device` raises what goes wrong there."""
         self._coming = {
-            view: self._coming.get(view) or self._threads.submit(self._pixels, view, self.halved)
+            view: self._coming.get(view) or self._threads.submit(self._pixels, view)
             for view in views
             if view not in self._kept
         }
@@ -69,7 +68,7 @@ class GroundTruth:
         array = self._kept.pop(view, None)
         if array is None:
             coming = self._coming.pop(view, None)
-            pixels = coming.result() if coming else self._pixels(view, self.halved)
+            pixels = coming.result() if coming else self._pixels(view)
             array = upload_rgba(self._device, pixels)
         if array.buffer.nbytes <= self._max_bytes:
             while self.used_bytes + array.buffer.nbytes > self._max_bytes:
@@ -81,20 +80,23 @@ class GroundTruth:
         """The image of a view on the background. Raises InputError where it cannot be read."""
         return host_image(self.on_device(view).read())
 
-    def _pixels(self, view: View, halved: bool) -> NDArray[np.uint8]:
-        shown = small_views([view], max(_half(view.camera)))[0] if halved else view
+    def _pixels(self, view: View) -> NDArray[np.uint8]:
+        shown = small_views([view], max(_half(view.camera)))[0] if self.halved else view
         return marked_pixels(shown, self.backgrounds[view])
 
     def close(self) -> None:
         """End the decoding, and forget all images: what follows a training needs the memory."""
         self._threads.shutdown(cancel_futures=True)
+        self._forget()
+
+    def _forget(self) -> None:
         self._coming.clear()
         self._kept.clear()
 
 
 def _half(camera: Camera) -> Size:
     stored = camera.width, camera.height
-    return shrunk_size(stored, max(1, max(stored) // 2))
+    return shrunk_size(stored, max(stored) // 2)
 
 
 def backgrounds_of(views: Sequence[View], config: DataConfig) -> dict[View, Tensor]:
