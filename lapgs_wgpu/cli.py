@@ -13,6 +13,7 @@ import typing
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from types import UnionType
 
 from lapgs_wgpu.command import DEVICE_HELP, LIST_DEVICES_HELP, Parser, guarded, print_devices
 from lapgs_wgpu.errors import InputError
@@ -214,7 +215,8 @@ def keys_help(preset: str) -> str:
         shown = " ".join(entry if isinstance(entry, str) else json.dumps(entry) for entry in entries)
         kinds = typing.get_args(kind) or (kind,)
         literal = typing.get_origin(kind) is typing.Literal
-        metavar = "|".join(kinds) if literal else " ".join(_METAVARS[each] for each in kinds)
+        between = "|" if isinstance(kind, UnionType) else " "
+        metavar = "|".join(kinds) if literal else between.join(_METAVARS[each] for each in kinds)
         option = f"{', '.join([*SHORTCUTS.get(name, []), f'--{name}'])} {metavar}"
         first, others = f"  {option:<38}  ", " " * 42
         text += f" [{shown}]" if shown else ""

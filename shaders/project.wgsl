@@ -45,7 +45,7 @@ fn projected(i: u32) -> Projected {
     let jacobian = frame.focal / camera.z;
     let scale = vec3(scales_at(3u * i), scales_at(3u * i + 1u), scales_at(3u * i + 2u));
     let R = view_rotation(frame) * rotation(q * inverseSqrt(norm));
-    let f = footprint(R, scale, jacobian, xy);
+    let f = footprint(R, scale, jacobian, xy, frame.low_pass);
     if (!finite(f.det) || !(f.det > 0.0) || !(f.det < 1e30)) {
         return p;
     }

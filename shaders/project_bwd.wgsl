@@ -62,7 +62,7 @@ fn main(
     let q = quats_at(i) * norm;
     let view = view_rotation(frame);
     let R = view * rotation(q);
-    let f = footprint(R, scale, jacobian, xy);
+    let f = footprint(R, scale, jacobian, xy, frame.low_pass);
     let a = f.yy / f.det;
     let b = -f.xy / f.det;
     let c = f.xx / f.det;
@@ -76,9 +76,9 @@ fn main(
     // loses some memory at each run.
     let half = 0.5 * d1.y;
     let antialiased = frame.antialiased == 1u;
-    d_xx += select(0.0, half * ((f.yy - DILATION) / f.flat - a), antialiased);
+    d_xx += select(0.0, half * ((f.yy - frame.low_pass) / f.flat - a), antialiased);
     d_xy += select(0.0, 2.0 * half * (-f.xy / f.flat - b), antialiased);
-    d_yy += select(0.0, half * ((f.xx - DILATION) / f.flat - c), antialiased);
+    d_yy += select(0.0, half * ((f.xx - frame.low_pass) / f.flat - c), antialiased);
     let d_axes_x = 2.0 * d_xx * f.axes_x + d_xy * f.axes_y;
     let d_axes_y = 2.0 * d_yy * f.axes_y + d_xy * f.axes_x;
 

@@ -157,7 +157,12 @@ def test_a_scene_to_start_from_keeps_its_shape_and_its_timing(dataset: Dataset, 
     config = configure()
     scenes = [
         Scene4D.from_points(
-            np.zeros((40, 3)), np.zeros((40, 3)), np.ones(40), config.field, antialiased=True, device=device
+            np.zeros((40, 3)),
+            np.zeros((40, 3)),
+            np.ones(40),
+            config.field,
+            antialiased=config.antialiased,
+            device=device,
         )
         for _ in range(2)
     ]

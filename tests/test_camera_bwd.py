@@ -50,7 +50,12 @@ def expected(
 
 
 def found(
-    device: Device, scene: dict[str, torch.Tensor], camera: Camera, weights: np.ndarray, *, antialiased: bool = False
+    device: Device,
+    scene: dict[str, torch.Tensor],
+    camera: Camera,
+    weights: np.ndarray,
+    *,
+    antialiased: bool | float = False,
 ) -> tuple[np.ndarray, np.ndarray]:
     rasterizer = Rasterizer(device)
     tensors = {"sh" if name == "colors" else name: value for name, value in scene.items()}
@@ -66,10 +71,15 @@ def found(
     return np.concatenate(camera_gradient(sums)), sums
 
 
-@pytest.mark.parametrize(("sh", "antialiased"), [(None, False), (0, False), (2, False), (0, True)])
+@pytest.mark.parametrize(("sh", "antialiased"), [(None, False), (0, False), (2, False), (0, True), (0, 0.1)])
 @pytest.mark.parametrize(("count", "camera"), [(70, front_camera(32, 24)), (150, oblique_camera(61, 47))])
 def test_camera_bwd(
-    monkeypatch: pytest.MonkeyPatch, device: Device, sh: int | None, antialiased: bool, count: int, camera: Camera
+    monkeypatch: pytest.MonkeyPatch,
+    device: Device,
+    sh: int | None,
+    antialiased: bool | float,
+    count: int,
+    camera: Camera,
 ) -> None:
     scene = random_scene(count, 1, sh=None if sh is None else (sh + 1) ** 2)
     weights = np.random.default_rng(0).normal(size=(camera.height, camera.width, 3))

@@ -80,12 +80,12 @@ def test_equal_scenes_give_equal_bytes(device: Device, tmp_path: Path) -> None:
 
 def test_a_still_scene(device: Device, tmp_path: Path) -> None:
     scene = moving_scene(device, FieldConfig(kind="static"), sh_degree=1)
-    scene.antialiased = True
+    scene.antialiased = 0.1
     scene.save(tmp_path / "a.ply")
     found = read_scene(compact(device, tmp_path, read_scene(tmp_path / "a.ply")))
     assert found.field == {}
     assert found.sh_degree == 1
-    assert found.antialiased
+    assert found.antialiased == 0.1
     assert not found.gaussians["sh_rest"][:, 3:].any()
 
 

@@ -21,7 +21,7 @@ from lapgs_wgpu.splat.rasterizer import Rasterizer
 
 # Check, shader, text of the shader, and what stands there instead.
 MISTAKES = [
-    (0, "common/gaussian", "dot(u, u) + DILATION", "dot(u, u) + 1.01 * DILATION"),
+    (0, "common/gaussian", "dot(u, u) + low_pass", "dot(u, u) + 1.01 * low_pass"),
     (0, "sort_scatter", "payload_at(i);", "payload_at(i ^ 1u);"),
     (0, "scan_apply", "sum += element(i);", "sum += element(i) & 3u;"),
     (1, "project_bwd", "let along_x = jacobian.x *", "let along_x = 1.01 * jacobian.x *"),

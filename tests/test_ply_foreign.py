@@ -114,14 +114,17 @@ def test_doubles_far_from_the_origin(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "448262" in capsys.readouterr().err
 
 
-def test_an_antialiased_still_is_drawn_as_its_checkpoint(tmp_path: Path, device: Device) -> None:
+@pytest.mark.parametrize(("antialiased", "comments"), [(True, b""), (0.1, b"comment LowPass: 0.1\n")])
+def test_an_antialiased_still_is_drawn_as_its_checkpoint(
+    tmp_path: Path, device: Device, antialiased: bool | float, comments: bytes
+) -> None:
     scene = moving_scene(device, sh_degree=3)
-    scene.antialiased = True
+    scene.antialiased = antialiased
     scene.save(tmp_path / "a.ply")
     loaded = load_scene(tmp_path / "a.ply", lambda: device)
     assert export_still(loaded, tmp_path / "still.ply", 0.5).psnr >= 100
-    assert b"\ncomment SplatRenderMode: mip\n" in (tmp_path / "still.ply").read_bytes()
-    assert load(tmp_path / "still.ply", device).antialiased
+    assert b"\ncomment SplatRenderMode: mip\n" + comments + b"end_header" in (tmp_path / "still.ply").read_bytes()
+    assert load(tmp_path / "still.ply", device).antialiased == antialiased
     assert not load_scene(tmp_path / "still.ply", lambda: device, antialiased=False).playback.at(0.0).antialiased
     plain = load_scene(tmp_path / "a.ply", lambda: device, antialiased=False)
     export_still(plain, tmp_path / "plain.ply", 0.5)

@@ -22,7 +22,7 @@ ROUND = [1.0, 0.0, 0.0, 0.0]
 
 
 def projected(
-    monkeypatch: pytest.MonkeyPatch, device: Device, scene: Scene, camera: Camera, *, antialiased: bool = False
+    monkeypatch: pytest.MonkeyPatch, device: Device, scene: Scene, camera: Camera, *, antialiased: bool | float = False
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """(N, 12) what the pass leaves of each Gaussian, in float64 (see common/splat.wgsl), and (N,) its tile counts."""
     copies = capture(monkeypatch, "project", "splats", "tile_counts")
@@ -34,7 +34,7 @@ def projected(
 
 
 def check(
-    monkeypatch: pytest.MonkeyPatch, device: Device, scene: Scene, camera: Camera, *, antialiased: bool = False
+    monkeypatch: pytest.MonkeyPatch, device: Device, scene: Scene, camera: Camera, *, antialiased: bool | float = False
 ) -> None:
     splats, tile_counts = projected(monkeypatch, device, scene, camera, antialiased=antialiased)
     geometry = [scene[name].double() for name in ("means", "quats", "scales", "opacities")]
@@ -56,10 +56,10 @@ def check(
     torch.testing.assert_close(splats[:, 11], 1 / (conics[:, 0] * conics[:, 2] - conics[:, 1] ** 2), rtol=1e-3, atol=0)
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("antialiased", [False, True, 0.1])
 @pytest.mark.parametrize(("count", "size", "spread"), [(1000, 0.05, 0.8), (1000, 0.5, 0.8), (1000, 0.003, 3.0)])
 def test_random_gaussians(
-    monkeypatch: pytest.MonkeyPatch, device: Device, count: int, size: float, spread: float, antialiased: bool
+    monkeypatch: pytest.MonkeyPatch, device: Device, count: int, size: float, spread: float, antialiased: bool | float
 ) -> None:
     scene = random_scene(count, 1, size=size, spread=spread)
     check(monkeypatch, device, scene, oblique_camera(101, 61), antialiased=antialiased)

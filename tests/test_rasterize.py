@@ -38,7 +38,7 @@ def compare(
     *,
     sh_degree: int | None = None,
     background: Tensor | None = None,
-    antialiased: bool = False,
+    antialiased: bool | float = False,
     weights: Weights | None = None,
     fragile_share: float = 0.1,
 ) -> None:
@@ -119,11 +119,11 @@ def test_splats_close_to_the_camera(device: Device) -> None:
 # Antialiased
 
 
-@pytest.mark.parametrize(("count", "size", "sh_degree"), [(100, 0.3, None), (1000, 0.05, 3)])
-def test_antialiased_scenes(device: Device, count: int, size: float, sh_degree: int | None) -> None:
+@pytest.mark.parametrize(("count", "size", "sh_degree", "low_pass"), [(100, 0.3, None, 0.1), (1000, 0.05, 3, True)])
+def test_antialiased_scenes(device: Device, count: int, size: float, sh_degree: int | None, low_pass: float) -> None:
     stored = None if sh_degree is None else (sh_degree + 1) ** 2
     scene = random_scene(count, seed=count, sh=stored, size=size)
-    compare(device, scene, oblique_camera(101, 61), sh_degree=sh_degree, background=BACKGROUND, antialiased=True)
+    compare(device, scene, oblique_camera(101, 61), sh_degree=sh_degree, background=BACKGROUND, antialiased=low_pass)
 
 
 @pytest.mark.nightly

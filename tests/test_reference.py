@@ -78,12 +78,13 @@ def test_single_gaussian_pixels_by_hand() -> None:
     assert radii.dtype == torch.int32
 
 
-def test_antialiased_opacity_by_hand() -> None:
+@pytest.mark.parametrize(("antialiased", "low_pass"), [(True, 0.3), (0.1, 0.1)])
+def test_antialiased_opacity_by_hand(antialiased: bool | float, low_pass: float) -> None:
     """A Gaussian whose half axes are 0.6 and 0.2 pixels, and turned, so that its covariance is no diagonal."""
     quat = torch.tensor([[math.cos(0.3), 0, 0, math.sin(0.3)]])
     mean, scales, opacity = torch.tensor([[0.0, 0, 2]]), torch.tensor([[0.12, 0.04, 0.3]]), torch.tensor([0.9])
-    projection = project(mean, quat, scales, opacity, FRONT, antialiased=True)
-    faded = 0.9 * 0.6 * 0.2 / math.sqrt((0.36 + 0.3) * (0.04 + 0.3))
+    projection = project(mean, quat, scales, opacity, FRONT, antialiased=antialiased)
+    faded = 0.9 * 0.6 * 0.2 / math.sqrt((0.36 + low_pass) * (0.04 + low_pass))
     assert projection.opacities.item() == pytest.approx(faded, abs=1e-14)
     tau = 2 * math.log(255 * faded)
     assert projection.tau.item() == pytest.approx(tau, abs=1e-12)
@@ -290,9 +291,10 @@ def test_delicate_scene_visits_every_rule() -> None:
 
 
 @pytest.mark.parametrize(
-    ("sh_degree", "antialiased"), [(None, False), (0, False), (1, False), (2, False), (3, False), (None, True)]
+    ("sh_degree", "antialiased"),
+    [(None, False), (0, False), (1, False), (2, False), (3, False), (None, True), (None, 0.1)],
 )
-def test_gradcheck(sh_degree: int | None, antialiased: bool) -> None:
+def test_gradcheck(sh_degree: int | None, antialiased: bool | float) -> None:
     scene, camera = delicate_scene(sh_degree)
     how: dict[str, Any] = {"camera": camera, "sh_degree": sh_degree, "antialiased": antialiased}
     risky = near_discontinuity(**scene, **how, band=1e-4, gate=1e-5)

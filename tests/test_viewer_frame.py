@@ -56,11 +56,16 @@ def app_by_the_clock(file: Path, device: Device, monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.triangles
-def test_antialiased_is_switched_by_a_key(tmp_path: Path, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    trained(device, GRID4D, 50).save(tmp_path / "a.ply")
+@pytest.mark.parametrize("low_pass", [False, 0.1])
+def test_antialiased_is_switched_by_a_key(
+    tmp_path: Path, device: Device, monkeypatch: pytest.MonkeyPatch, low_pass: bool | float
+) -> None:
+    scene = trained(device, GRID4D, 50)
+    scene.antialiased = low_pass
+    scene.save(tmp_path / "a.ply")
     canvas, app, now = app_by_the_clock(tmp_path / "a.ply", device, monkeypatch)
     pictures = []
-    for antialiased in (False, True):
+    for antialiased in (bool(low_pass), not low_pass):
         assert app.state.antialiased == antialiased
         canvas.draw()
         now[0] += 1

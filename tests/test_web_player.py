@@ -164,10 +164,13 @@ def test_every_field(window: Browser, folder: Path, device: Device, name: str) -
 
 
 @pytest.mark.nightly
-def test_an_antialiased_scene_of_uneven_timing(window: Browser, folder: Path, device: Device) -> None:
+@pytest.mark.parametrize("low_pass", [True, 0.1])
+def test_an_antialiased_scene_of_uneven_timing(
+    window: Browser, folder: Path, device: Device, low_pass: bool | float
+) -> None:
     scene = trained(device, OURS, 300)
     without = Desktop(export_scene(scene, folder, device, "even"), device)
-    scene.antialiased = True
+    scene.antialiased = low_pass
     scene.timing = Timing(np.array([0.2, 0.4, 0.8]), np.array([0.1, 0.5, 0.7]))
     made = export_scene(scene, folder, device, "uneven")
     open_page(window, made.as_uri())

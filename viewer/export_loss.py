@@ -104,7 +104,7 @@ def plain_factors(scene: LoadedScene) -> NDArray[np.floating]:
         unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
         axes = J @ R @ rotation_matrix(unit.T).transpose(2, 0, 1) * scales[:, None, :]
         covariance = axes @ axes.transpose(0, 2, 1)
-        larger = covariance + CONSTANTS["DILATION"] * np.eye(2)
+        larger = covariance + now.low_pass * np.eye(2)
         # The roots of the areas without and with the low-pass filter.
         faded = np.sqrt(np.linalg.det(covariance).clip(0) / np.linalg.det(larger))
         factors.append(np.where(ahead, faded, 1.0))

@@ -9,6 +9,7 @@ import numpy as np
 from lapgs_wgpu.gpu.array import BufferPool, DeviceArray
 from lapgs_wgpu.motion.playback.playback import Playback
 from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.gaussians import switched
 from lapgs_wgpu.splat.rasterizer import Rasterizer
 from lapgs_wgpu.viewer.render_modes import MODES, Mode
 
@@ -59,12 +60,13 @@ class FrameRenderer:
         """Draw, and wait until it is done."""
         start = time.perf_counter()
         low, high, background = 0.0, 1.0, request.background
-        changes: dict[str, Any] = {} if request.antialiased is None else {"antialiased": request.antialiased}
+        changes: dict[str, Any] = {}
         if request.mode == "motion":  # before the Gaussians, which measuring takes to other times
             self.moved = self.moved or self._measure_motion()
             changes["sh"], high = self.moved
             background = (0.0, 0.0, 0.0)
-        gaussians = dataclasses.replace(self.playback.at(request.time), **changes)
+        now = self.playback.at(request.time)
+        gaussians = dataclasses.replace(now, antialiased=switched(now.antialiased, request.antialiased), **changes)
         depths = request.mode == "depth"
         drawing = self._rasterizer.draw_whole(gaussians, request.camera, background, depth=depths)
         splats = int(drawing.arrays["visible"].read()[0])

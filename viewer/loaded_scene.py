@@ -18,6 +18,7 @@ from lapgs_wgpu.io.safe_json_toml import read_toml
 from lapgs_wgpu.motion.playback.playback import Playback, playback_of
 from lapgs_wgpu.motion.scene_file import SceneFile, read_scene
 from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.gaussians import switched
 from lapgs_wgpu.viewer.camera import ViewCamera, orbit_views
 from lapgs_wgpu.viewer.clock import Clock
 from lapgs_wgpu.viewer.moving_files import MANIFEST, SampledPlayback, open_moving
@@ -98,8 +99,7 @@ def load_scene(
         playback, frames = SampledPlayback(device(), moving, antialiased), moving.frames
     else:
         file = read_scene(path)
-        if antialiased is not None:
-            file = dataclasses.replace(file, antialiased=antialiased)
+        file = dataclasses.replace(file, antialiased=switched(file.antialiased, antialiased))
         playback, frames = playback_of(file, device()), None
     stored = InitialView.from_json(playback.metadata.get("view", ""))
     view = stored if stored and up is None else guess_view(playback, up or playback.metadata.get("up"))

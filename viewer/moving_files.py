@@ -24,7 +24,7 @@ from lapgs_wgpu.motion.playback.playback import activate, opacity_logits
 from lapgs_wgpu.motion.scene_file import SceneFile, read_scene
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.constants import CONSTANTS
-from lapgs_wgpu.splat.gaussians import Gaussians
+from lapgs_wgpu.splat.gaussians import Gaussians, switched
 from lapgs_wgpu.splat.linear_light import display_harmonics
 from lapgs_wgpu.viewer.options import USD
 
@@ -64,7 +64,7 @@ class SampledPlayback:
         if self._time != t:
             now = self._sample(t)
             arrays = {name: self._pool.upload(name, values) for name, values in now.arrays().items()}
-            antialiased = now.antialiased if self._antialiased is None else self._antialiased
+            antialiased = switched(now.antialiased, self._antialiased)
             self._now, self._time = Gaussians(**arrays, antialiased=antialiased), t
         return self._now
 

@@ -31,7 +31,7 @@ class ViewState:
         self.scene, self.renderer = scene, FrameRenderer(scene.playback)
         self.camera, self.clock = scene.camera(), scene.clock()
         self.background = scene.background
-        self.antialiased = scene.playback.at(0.0).antialiased
+        self.antialiased = bool(scene.playback.at(0.0).antialiased)
         self.show_transport = scene.playback.moves
         self.view = -1
 

@@ -6,6 +6,7 @@ import operator
 import typing
 from collections.abc import Iterable
 from contextlib import suppress
+from types import UnionType
 from typing import Any, Literal, TypeVar
 
 from lapgs_wgpu.errors import InputError, shown
@@ -83,13 +84,16 @@ def checked(kind: Any, value: Any, where: str, least: float = 0) -> Any:
             raise InputError(f"{where} must be {'a list' if many else f'{len(parts)} numbers'}, got {shown(value)}.")
         kinds = parts[:1] * len(value) if many else parts
         return tuple(checked(part, entry, where, least) for part, entry in zip(kinds, value, strict=True))
+    name = _KIND_NAMES.get(kind, "a table")
+    if origin is UnionType:
+        kind, origin = bool if isinstance(value, bool) or value in ("true", "false") else float, None
     if isinstance(value, str) and kind is bool:
-        value = {"true": True, "false": False}.get(value, value)
+        value = _BOOLEANS.get(value, value)
     elif isinstance(value, str) and kind in (int, float):
         with suppress(ValueError):
             value = kind(value)
     if type(value) is not (origin or kind) and not (kind is float and type(value) is int):
-        raise InputError(f"{where} must be {_KIND_NAMES.get(kind, 'a table')}, got {shown(value)}.")
+        raise InputError(f"{where} must be {name}, got {shown(value)}.")
     if kind in (int, float) and not least <= value <= LARGEST_NUMBER:
         raise InputError(f"{where} must lie between {least:g} and {LARGEST_NUMBER}, got {shown(value)}.")
     if kind is str and not value.isprintable():
@@ -97,7 +101,14 @@ def checked(kind: Any, value: Any, where: str, least: float = 0) -> Any:
     return float(value) if kind is float else value
 
 
-_KIND_NAMES = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
+_BOOLEANS = {"true": True, "false": False}
+_KIND_NAMES: dict[Any, str] = {
+    int: "a whole number",
+    float: "a number",
+    bool: "true or false",
+    bool | float: "true, false or a number",
+    str: "a text",
+}
 
 
 def field_types(cls: type) -> dict[str, Any]:

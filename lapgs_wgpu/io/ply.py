@@ -65,15 +65,15 @@ def write_ply(
     path: PathLike,
     still: GaussianSnapshot,
     *,
-    antialiased: bool = False,
+    antialiased: bool | float = False,
     trailer: str = "",
     buffers: Sequence[bytes | memoryview] = (),
 ) -> None:
     """Write Gaussians with exactly the 62 properties of 3DGS, SH padded with zeros to degree 3. Atomic.
 
-    antialiased: adds the comment by which Brush and others tell how Gaussians are drawn. trailer: lines that declare
-    a further element, whose rows are the buffers. Raises InputError when the file cannot be written or a value could
-    not be read back.
+    antialiased: adds the comment by which Brush and others tell how Gaussians are drawn, and a second one where it is a
+    variance. trailer: lines that declare a further element, whose rows are the buffers. Raises InputError when the file
+    cannot be written or a value could not be read back.
     """
     n, rest = len(still), still.sh.shape[1] - 1
     if n == 0:
@@ -86,6 +86,7 @@ def write_ply(
     _check_values(rows, _WRITTEN_NAMES, f"{path}: not written, because")
     properties = "".join(f"property float {name}\n" for name in _WRITTEN_NAMES)
     comment = "comment SplatRenderMode: mip\n" if antialiased else ""
+    comment += f"comment LowPass: {antialiased}\n" if antialiased and antialiased is not True else ""
     # Some viewers expect the count on the third line.
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {n}\n{properties}{comment}{trailer}"
     with atomic_write(path) as file:
@@ -107,8 +108,8 @@ def read_gaussians(ply: PlyFile) -> GaussianSnapshot:
 def read_foreign(ply: PlyFile) -> tuple[GaussianSnapshot, dict[str, str]]:
     """The Gaussians of a 3DGS .ply of any program, and as metadata what else it says. Notes go to stderr.
 
-    Metadata: `antialiased` is "true" where a comment says so; `up`, an axis such as "z" or "-y", is the comment's
-    vertical axis; `offset` is a JSON list of 3 numbers, which were taken off the means.
+    Metadata: `antialiased` is "true", or the variance of the filter, px², where comments say so; `up`, an axis such as
+    "z" or "-y", is the comment's vertical axis; `offset` is a JSON list of 3 numbers, which were taken off the means.
 
     Degree 0 may be given as colors; the third scale of flat Gaussians, or two scales and the quaternion of spherical
     ones, may be missing. An infinite opacity is opaque, or leaves the Gaussian out; a scale of 0 is flat; a quaternion
@@ -144,7 +145,8 @@ def read_foreign(ply: PlyFile) -> tuple[GaussianSnapshot, dict[str, str]]:
             values = np.insert(values, index, missing[name], axis=1)
     metadata, text = {}, "\n".join(ply.comments)
     if re.search(r"SplatRenderMode\s*[:=]\s*mip", text, re.IGNORECASE):
-        metadata["antialiased"] = "true"
+        low_pass = re.search(r"LowPass: ([\d.e-]+)$", text, re.MULTILINE)
+        metadata["antialiased"] = low_pass[1] if low_pass else "true"
     axis = re.search(r"(?:vertical|up)[ _]?axis\s*[:=]\s*\+?(-?[xyz])\b", text, re.IGNORECASE)
     if axis:
         metadata["up"] = axis[1].lower()

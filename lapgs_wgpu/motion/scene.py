@@ -76,7 +76,7 @@ class Scene4D:
         device: Device,
         *,
         sh_degree: int = 0,
-        antialiased: bool = False,
+        antialiased: bool | float = False,
         seed: int = 0,
         own_field: nn.Module | None = None,
     ) -> None:
@@ -108,7 +108,7 @@ class Scene4D:
         field_config: FieldConfig,
         *,
         opacity: float = 0.1,
-        antialiased: bool = False,
+        antialiased: bool | float = False,
         device: Device | None = None,
         seed: int = 0,
         own_field: nn.Module | None = None,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.checkpoint import read_checkpoint
-from lapgs_wgpu.io.dataclass_table import build_dataclass
+from lapgs_wgpu.io.dataclass_table import build_dataclass, checked
 from lapgs_wgpu.io.initial_view import InitialView
 from lapgs_wgpu.io.lapgs_file import lapgs_bytes, pack_lapgs, unpack_lapgs
 from lapgs_wgpu.io.safe_json_toml import PathLike, parse_json
@@ -40,7 +40,7 @@ class SceneFile:
     gaussians: dict[str, NDArray[np.float32]]
     field: dict[str, NDArray[np.float32]]
     metadata: dict[str, str]
-    antialiased: bool = False
+    antialiased: bool | float = False
     timing: Timing = EVEN
 
 
@@ -96,11 +96,11 @@ def compact_bytes(file: SceneFile, static_features: NDArray[np.float32] | None, 
         raise InputError(f"{file.path}: no compact scene can be made of it, because {error}") from error
 
 
-def scene_header(config: FieldConfig, sh_degree: int, antialiased: bool, timing: Timing) -> dict[str, str]:
+def scene_header(config: FieldConfig, sh_degree: int, antialiased: bool | float, timing: Timing) -> dict[str, str]:
     """Return the texts that a file needs beside its arrays, by name."""
     header = {"field": json.dumps(dataclasses.asdict(config)), "sh_degree": str(sh_degree)}
     if antialiased:
-        header["antialiased"] = "true"
+        header["antialiased"] = json.dumps(antialiased)
     if timing is not EVEN:
         header["timing"] = timing.to_text()
     return header
@@ -120,9 +120,7 @@ def _read_header(metadata: Mapping[str, str], path: PathLike) -> dict[str, Any]:
         degree = int(others.pop("sh_degree"))
         if not 0 <= degree <= 3:
             raise ValueError(f"sh_degree {degree} is outside 0 to 3")
-        antialiased = others.pop("antialiased", "false")  # older files lack it
-        if antialiased not in ("false", "true"):
-            raise ValueError(f"antialiased {antialiased!r} is neither true nor false")
+        antialiased = checked(bool | float, others.pop("antialiased", "false"), "antialiased")  # older files lack it
         timing = timing_of_text(others.pop("timing")) if "timing" in others else EVEN
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         reason = f"{type(error).__name__}: {error}"[:200]
@@ -130,7 +128,7 @@ def _read_header(metadata: Mapping[str, str], path: PathLike) -> dict[str, Any]:
             f"{path}: the checkpoint's description of its field cannot be read ({reason}): "
             "it was damaged, or written by another version of lapgs_wgpu"
         ) from error
-    described = {"field_config": config, "sh_degree": degree, "antialiased": antialiased == "true", "timing": timing}
+    described = {"field_config": config, "sh_degree": degree, "antialiased": antialiased, "timing": timing}
     return described | {"metadata": others}
 
 

@@ -49,7 +49,7 @@ def rasterize(
     *,
     sh_degree: int | None = None,
     background: Tensor | None = None,
-    antialiased: bool = False,
+    antialiased: bool | float = False,
     depth: bool = True,
     device: Device | None = None,
 ) -> Rendering:
@@ -65,7 +65,7 @@ def rasterize(
         background: (3,); None for black.
         camera: which renders the image.
         antialiased: whether a Gaussian is drawn as much fainter as the low-pass filter makes it larger in the image, as
-            gsplat's rasterize_mode "antialiased".
+            gsplat's rasterize_mode "antialiased"; a number is the filter's variance, px², otherwise 0.3.
         depth: whether to render depth, which takes a tenth of the time; otherwise it is zero.
         device: None for the default adapter.
 

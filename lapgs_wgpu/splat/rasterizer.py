@@ -212,7 +212,8 @@ class Rasterizer:
             size=(camera.width, camera.height),
             tiles=(columns, rows),
             band=self._band_rows(drawing, band),
-            antialiased=int(drawing.gaussians.antialiased),
+            low_pass=drawing.gaussians.low_pass,
+            antialiased=int(bool(drawing.gaussians.antialiased)),
             near=camera.near,
         )
 

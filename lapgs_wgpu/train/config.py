@@ -296,8 +296,9 @@ class Config(Options):
     timing: TimingConfig = option("", TimingConfig())
     discovery: DiscoveryConfig = option("", DiscoveryConfig())
     eval: EvalConfig = option("", EvalConfig())
-    antialiased: bool = option(
-        "lower the opacity of thin Gaussians by the factor by which the low-pass filter enlarges them (as in gsplat)",
+    antialiased: bool | float = option(
+        "lower the opacity of thin Gaussians by the factor by which the low-pass filter enlarges them (as in gsplat); "
+        "a number is the filter's variance, px^2, otherwise 0.3",
         False,
     )
     step_place: Literal["auto", "exchange", "resident"] = option(

@@ -1,6 +1,6 @@
 // Constants of the passes. Each number stands here once; Python reads this file, too (splat/constants.py).
 
-const DILATION: f32 = 0.3;                      // px^2, added to both variances of a splat: none falls between pixels
+const DILATION: f32 = 0.3;                      // px^2, the low-pass filter's variance where nothing else is said
 const NEAR: f32 = 0.01;                         // world units; a Gaussian at or before this camera depth is culled
 const FRUSTUM_MARGIN: f32 = 0.3;                // the Jacobian's x/z, y/z end this many half-images beyond the borders
 const MIN_SCALE: f32 = 1e-7;                     // world units; no scale is below it, at rest or deformed

@@ -10,6 +10,7 @@ struct Frame {
     size: vec2<u32>,        // image, pixels
     tiles: vec2<u32>,       // columns and rows of tiles
     band: vec2<u32>,        // first and one past the last row of tiles that this submission draws
-    antialiased: u32,       // 1: a splat is as much fainter as DILATION makes it larger
+    low_pass: f32,          // px^2, added to both variances of a splat: none falls between pixels
+    antialiased: u32,       // 1: a splat is as much fainter as low_pass makes it larger
     near: f32,              // world units; a Gaussian at or before this camera depth, or NEAR, is culled
 }

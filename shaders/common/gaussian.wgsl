@@ -28,21 +28,22 @@ fn jacobian_limits(frame: Frame) -> JacobianLimits {
 struct Footprint {
     axes_x: vec3<f32>,
     axes_y: vec3<f32>,
-    xx: f32,     // the covariance, dilated
+    xx: f32,     // the covariance behind the low-pass filter
     xy: f32,
     yy: f32,
-    flat: f32,   // the determinant before the dilation
+    flat: f32,   // the determinant before the filter
     det: f32,
 }
 
 // R: from the Gaussian's axes to the camera's. jacobian: focal lengths / depth. xy: x/z and y/z, within the limits.
-fn footprint(R: mat3x3<f32>, scale: vec3<f32>, jacobian: vec2<f32>, xy: vec2<f32>) -> Footprint {
+// low_pass: px^2.
+fn footprint(R: mat3x3<f32>, scale: vec3<f32>, jacobian: vec2<f32>, xy: vec2<f32>, low_pass: f32) -> Footprint {
     let u = jacobian.x * scale * vec3(R[0].x - xy.x * R[0].z, R[1].x - xy.x * R[1].z, R[2].x - xy.x * R[2].z);
     let v = jacobian.y * scale * vec3(R[0].y - xy.y * R[0].z, R[1].y - xy.y * R[1].z, R[2].y - xy.y * R[2].z);
-    let xx = dot(u, u) + DILATION;
-    let yy = dot(v, v) + DILATION;
+    let xx = dot(u, u) + low_pass;
+    let yy = dot(v, v) + low_pass;
     // The determinant without cancellation: |u x v|^2 is never negative.
     let normal = cross(u, v);
     let flat = dot(normal, normal);
-    return Footprint(u, v, xx, dot(u, v), yy, flat, flat + DILATION * (xx + yy - DILATION));
+    return Footprint(u, v, xx, dot(u, v), yy, flat, flat + low_pass * (xx + yy - low_pass));
 }

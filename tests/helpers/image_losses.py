@@ -40,7 +40,7 @@ TRUTH = random_pair(CAMERA.height, CAMERA.width).truth
 BACKGROUND = torch.tensor([0.2, 0.5, 0.9])
 
 
-def gaussians(count: int = 200, *, antialiased: bool = False, **changes: torch.Tensor) -> Gaussians:
+def gaussians(count: int = 200, *, antialiased: bool | float = False, **changes: torch.Tensor) -> Gaussians:
     scene = random_scene(count, 1, sh=4)
     tensors = {"sh" if name == "colors" else name: value for name, value in scene.items()} | changes
     return Gaussians(

@@ -63,7 +63,7 @@ def _frustum_limits(camera: Camera) -> list[tuple[float, float]]:
 
 
 def _project(
-    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, camera: Camera, antialiased: bool
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, camera: Camera, antialiased: bool | float
 ) -> tuple[Tensor, ...]:
     """means2d, conics, depths, tau, half_sides and opacities of every row as it is."""
     (fx, _, cx), (_, fy, cy) = camera.K[:2].tolist()
@@ -81,8 +81,9 @@ def _project(
     xx, xy, yy = (row_x * row_x).sum(-1), (row_x * row_y).sum(-1), (row_y * row_y).sum(-1)
     # xx yy - xy^2 without its cancellation, so a splat as thin as a needle keeps a positive determinant
     flat = torch.linalg.cross(row_x, row_y).square().sum(-1)
-    det = flat + DILATION * (xx + yy) + DILATION**2
-    variances = torch.stack([xx, yy], dim=-1) + DILATION
+    low_pass = DILATION if isinstance(antialiased, bool) else antialiased
+    det = flat + low_pass * (xx + yy) + low_pass**2
+    variances = torch.stack([xx, yy], dim=-1) + low_pass
     conics = torch.stack([variances[:, 1], -xy, variances[:, 0]], dim=-1) / det[:, None]
 
     if antialiased:
@@ -97,12 +98,19 @@ def _scattered(values: Tensor, rows: Tensor, count: int) -> Tensor:
 
 
 def project(
-    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, camera: Camera, *, antialiased: bool = False
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    camera: Camera,
+    *,
+    antialiased: bool | float = False,
 ) -> Projection:
     """Project Gaussians onto the image and cull.
 
     means: (N, 3) world. quats: (N, 4) wxyz. scales: (N, 3) standard deviations, world units. opacities: (N,);
-    antialiased, they are drawn fainter by the ratio of the splat's area without DILATION to that with it.
+    antialiased, they are drawn fainter by the ratio of the splat's area without the low-pass filter to that with it; a
+    number is the filter's variance, px^2.
     Invisible: depth <= NEAR or camera.near, opacity as drawn < ALPHA_MIN, anything not finite, or an ellipse whose
     bounding box lies wholly outside the image. camera.K's skew is ignored.
     """
@@ -232,7 +240,7 @@ def rasterize_reference(
     *,
     sh_degree: int | None = None,
     background: Tensor | None = None,
-    antialiased: bool = False,
+    antialiased: bool | float = False,
     means2d_offset: Tensor | None = None,
 ) -> Rendering:
     """Render N Gaussians in the tensors' own precision, differentiable in all of them.
@@ -262,7 +270,7 @@ def near_discontinuity(
     camera: Camera,
     *,
     sh_degree: int | None = None,
-    antialiased: bool = False,
+    antialiased: bool | float = False,
     band: float = 1e-3,
     gate: float = 1e-6,
 ) -> Tensor:

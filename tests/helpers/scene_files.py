@@ -106,7 +106,10 @@ DAMAGE: dict[str, tuple[Callable[[dict[str, Any], dict[str, str]], object], str]
     "no degree": (lambda _, m: m.pop("sh_degree"), "description of its field"),
     "not JSON": (lambda _, m: m.update(field="{"), "description of its field"),
     "degree 4": (lambda _, m: m.update(sh_degree="4"), "sh_degree 4 is outside 0 to 3"),
-    "antialiased by half": (lambda _, m: m.update(antialiased="half"), "antialiased 'half' is neither true nor false"),
+    "antialiased by half": (
+        lambda _, m: m.update(antialiased="half"),
+        "antialiased must be true, false or a number, got 'half'",
+    ),
     "timing that is not JSON": (lambda _, m: m.update(timing="{"), "its timing: cannot be read as JSON"),
     "times alone": (lambda _, m: m.update(timing='{"times": [0]}'), "timing is no table of times and moments"),
     "time that goes back": (

@@ -116,7 +116,7 @@ def step(
     *,
     sh_degree: int | None = None,
     background: Tensor | None = None,
-    antialiased: bool = False,
+    antialiased: bool | float = False,
     weights: Weights | None = None,
 ) -> Step:
     """One forward and backward pass on the device."""
@@ -138,7 +138,7 @@ def reference_step(
     *,
     sh_degree: int | None = None,
     background: Tensor | None = None,
-    antialiased: bool = False,
+    antialiased: bool | float = False,
     weights: Weights | None = None,
 ) -> Step:
     """The same in float64 on the processor. Pixels near a discontinuity must have no weight."""
@@ -161,7 +161,9 @@ def _gradients(leaves: Scene, background: Tensor | None, means2d: Tensor | None)
     return {name: torch.empty(0) if value is None else value for name, value in found.items()}
 
 
-def fragile_pixels(scene: Scene, camera: Camera, sh_degree: int | None = None, *, antialiased: bool = False) -> Tensor:
+def fragile_pixels(
+    scene: Scene, camera: Camera, sh_degree: int | None = None, *, antialiased: bool | float = False
+) -> Tensor:
     """(H, W) bool: pixels where rounding may decide between two results."""
     exact = {name: value.double() for name, value in scene.items()}
     return near_discontinuity(**exact, camera=camera, sh_degree=sh_degree, antialiased=antialiased)

@@ -104,7 +104,7 @@ async function prepare(gpu, scene, data, former, progress) {
     const trained = scene.metadata.background; // on it
     const background = data.backgrounds[Object.hasOwn(data.backgrounds, trained) ? trained : "black"];
     delete scene.gaussians; // the device has them now
-    const { antialiased } = scene;
+    const antialiased = Boolean(scene.antialiased);
     const state = former ?? { camera: new ViewCamera(first), clock, background, antialiased, fresh: true };
     return reopen => start(gpu, { scene, playback, rasterizer }, state, data, reopen);
 }

@@ -92,7 +92,7 @@ export class Rasterizer {
         const frame = pool.uniform(`frame ${band}`, gpu.kernel("compact"), "frame", {
             view: camera.view, focal: camera.focal, center: camera.center, position: camera.position, gaussians: n,
             background, capacity, size: [camera.width, camera.height], tiles: [columns, rows], band: [top, bottom],
-            antialiased: Number(antialiased), near: camera.near,
+            low_pass: antialiased && antialiased !== true ? antialiased : 0.3, antialiased: antialiased ? 1 : 0, near: camera.near,
         });
         const [counts, ids, keys, offsets] = ["tile counts", "ids", "depth keys", "offsets"].map(name => pool.array(name, 4 * n));
         const visible = pool.array("visible", 4);

@@ -14,7 +14,7 @@ const damaged = reason => new Refusal(`The scene cannot be read: ${reason}; the 
 export async function readScene(bytes) {
     const { tensors, metadata } = await readContainer(bytes);
     const shDegree = whole(Number(metadata.sh_degree ?? NaN), "sh_degree", 0, 3);
-    const antialiased = metadata.antialiased === "true"; // older files lack it
+    const antialiased = readAntialiased(metadata.antialiased ?? "false"); // older files lack it
     const timing = metadata.timing === undefined ? null : readTiming(metadata.timing);
     const field = readField(metadata.field);
     const means = tensors.get("gaussians.means");
@@ -30,6 +30,13 @@ export async function readScene(bytes) {
     }
     const parameters = field ? readParameters(tensors, field) : {};
     return { count, shDegree, antialiased, timing, field, gaussians, parameters, metadata };
+}
+
+// A number is the variance of the low-pass filter, px^2.
+function readAntialiased(text) {
+    const value = new Map([["true", true], ["false", false]]).get(text) ?? Number(text);
+    if (!(value >= 0 && value < 1e6)) throw damaged(`its antialiased is ${quoted(text)}`);
+    return value;
 }
 
 function whole(value, name, low, high) {

@@ -62,7 +62,8 @@ export class Viewport {
     async drawWhole(scale, depth = false) {
         const { canvas, state, rasterizer } = this;
         const [width, height] = [canvas.width, canvas.height].map(size => Math.max(1, Math.round(scale * size)));
-        const gaussians = { ...this.playback.at(state.clock.time), antialiased: state.antialiased };
+        const now = this.playback.at(state.clock.time);
+        const gaussians = { ...now, antialiased: state.antialiased && (now.antialiased || true) };
         const camera = state.camera.camera(canvas.width, canvas.height);
         const image = { ...camera, width, height, focal: scaled(camera.focal, canvas, width, height),
             center: scaled(camera.center, canvas, width, height) };

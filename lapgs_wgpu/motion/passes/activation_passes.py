@@ -26,7 +26,13 @@ class ActivationPasses:
         self._mirror = float(config.negative_scales == "mirror")
 
     def activate(
-        self, commands: Commands, values: FieldArrays, degree: int, decoding: Decoding | None, *, antialiased: bool
+        self,
+        commands: Commands,
+        values: FieldArrays,
+        degree: int,
+        decoding: Decoding | None,
+        *,
+        antialiased: bool | float,
     ) -> Gaussians[DeviceArray]:
         """Record the activation of Gaussians; without a decoding they stand still.
 
