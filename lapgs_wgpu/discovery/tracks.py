@@ -86,8 +86,9 @@ def find_tracks(clouds: PointClouds) -> Tracks | None:
     """
     closest, best = 0.0, None
     for trajectories in find_trajectories(clouds):
+        known: dict[tuple[int, ...], tuple[Tracks, Floats] | None] = {}
         for many in (0.5, 0.75):  # quantiles over the times
-            if (tracks := _tracks_by(many, clouds, trajectories)) is None:
+            if (tracks := _tracks_by(many, clouds, trajectories, known)) is None:
                 continue
             apart = [distances / (CLOSE * clouds.half_side) for distances, _ in clouds.nearest(tracks.paths)]
             if (close := sum(float(np.exp(-0.5 * each**2).sum()) for each in apart)) > closest:
@@ -97,10 +98,19 @@ def find_tracks(clouds: PointClouds) -> Tracks | None:
     return best
 
 
-def _tracks_by(many: float, clouds: PointClouds, trajectories: list[Trajectory]) -> Tracks | None:
-    """The tracks from key times at which as many parts are apart as this quantile of all times has."""
+def _tracks_by(
+    many: float,
+    clouds: PointClouds,
+    trajectories: list[Trajectory],
+    known: dict[tuple[int, ...], tuple[Tracks, Floats] | None],
+) -> Tracks | None:
+    """The tracks from key times at which as many parts are apart as this quantile of all times has.
+
+    known: what `_tracks_from` found by the key times up to its own; it grows.
+    """
     free = [np.ones(len(cloud.scores), bool) for cloud in clouds.clouds]
     found: list[Tracks] = []
+    keys: tuple[int, ...] = ()
     for _ in range(4):  # key times
         rest = [cloud.chosen(mask) for cloud, mask in zip(clouds.clouds, free, strict=True)]
         key = _key_time(rest, many, clouds)
@@ -110,8 +120,10 @@ def _tracks_by(many: float, clouds: PointClouds, trajectories: list[Trajectory])
             points._replace(scores=points.scores * np.where(mask, 1.0, EXPLAINED).astype(np.float32))
             for points, mask in zip(clouds.clouds, free, strict=True)
         )
-        followed = _tracks_from(key, _around(rest, key), clouds._replace(clouds=weighted), trajectories)
-        if followed is None:
+        keys += (key,)
+        if keys not in known:
+            known[keys] = _tracks_from(key, _around(rest, key), clouds._replace(clouds=weighted), trajectories)
+        if (followed := known[keys]) is None:
             break
         tracks, paths = followed
         reached = [(distances < REACH * clouds.half_side, of) for distances, of in clouds.nearest(paths)]
