@@ -55,6 +55,9 @@ def test_one_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest
     errors = pose_errors(found, {f"{100 * i:08d}.jpg": camera.position for i, camera in enumerate(cameras)})
     assert len(errors) == len(times)
     assert errors.max() < 0.03
+    assert prepare_command([str(path), "--out", str(tmp_path / "again")]) == 0
+    models = [sorted((folder / "sparse" / "0").iterdir()) for folder in (out, tmp_path / "again")]
+    assert [one.read_bytes() for one in models[0]] == [other.read_bytes() for other in models[1]]
 
 
 def test_films_of_still_cameras(tmp_path: Path, capfd: pytest.CaptureFixture) -> None:

@@ -18,6 +18,7 @@ MOST_FEATURES = 2000  # of an image, the strongest; the time of matching grows w
 RATIO, LIKE = 0.9, 0.7  # of the distances of the best and the second match; cosine of two descriptors, at least
 LEAST_ANGLE = 0.5  # degrees between the rays of a point
 SEED = 0
+THREADS = 1  # that solve: the sums of several differ from run to run
 Pair = tuple[str, str]
 Ints = NDArray[np.integer]
 Floats = NDArray[np.float64]
@@ -127,6 +128,7 @@ class Reconstruction:
             mapper, adjustment = options.mapper, options.mapper.bundle_adjustment
             for part in (options, mapper, mapper.rotation_averaging, mapper.global_positioning):
                 part.random_seed = SEED
+            options.num_threads = mapper.num_threads = THREADS
             mapper.min_tri_angle_deg = LEAST_ANGLE
             mapper.track_required_tracks_per_view = 150
             adjustment.ceres.solver_options.function_tolerance = 1e-4
@@ -135,6 +137,7 @@ class Reconstruction:
         else:
             options = colmap.IncrementalPipelineOptions()
             options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
+            options.num_threads = options.mapper.num_threads = THREADS
             options.min_model_size = 2
             options.max_runtime_seconds = round(seconds)
             options.ba_refine_focal_length = options.ba_refine_extra_params = not held
@@ -148,7 +151,8 @@ class Reconstruction:
     def given(self, cameras: Mapping[str, tuple[Lens, Floats]]) -> Any:
         """As `unpointed`, with points by the verified matches. The model must be OPENCV."""
         options = self._colmap.IncrementalPipelineOptions()
-        options.triangulation.random_seed, options.triangulation.min_angle = SEED, LEAST_ANGLE
+        options.num_threads, options.triangulation.random_seed = THREADS, SEED
+        options.triangulation.min_angle = LEAST_ANGLE
         options.mapper.filter_min_tri_angle = LEAST_ANGLE
         model = self.unpointed(cameras)
         return self._colmap.triangulate_points(model, self._database, self.images, self._models, options=options)
