@@ -429,7 +429,7 @@ def test_discovery_starts_a_training_which_goes_on_to_the_same_bits(
 def test_a_training_draws_a_scene_that_it_starts_from_as_it_is_drawn(dataset: Dataset, device: Device) -> None:
     config = configure()
     scene = Scene4D.from_points(np.zeros((3, 3)), np.zeros((3, 3)), np.ones(3), config.field, device=device)
-    with pytest.raises(InputError, match="antialiased = False, and the configuration says 0.1"):
+    with pytest.raises(InputError, match="antialiased = False, and the configuration says 0"):
         Trainer(config, dataset, device, scene=scene)
 
 
