@@ -42,7 +42,7 @@ from lapgs_wgpu.train.trainer import Trainer
 DYNAMICS = 0.5  # standard deviation of the dynamics attribute of a discovered Gaussian, which it shares with its part
 NEARLY_ALL = 0.8  # share of the surface points that tracks explain, above which the field has little left to learn
 ALL_TURN = 0.1  # of the field's highest rates, where all that moves turns: it forgets turns sooner than places
-SHEETS = 4.0  # by the square of the number of sheets, the same of these, at most 0.1: few images show each of many
+SHEETS = 0.01  # the same of sheets, of which few images show each
 FIT_STEPS_PER_TIME = 30  # of `fit_field` on a rig, at least: what flies fast is lost by fewer
 RAMP_STEPS = 200  # over which learning rates rise after discovery, where schedule.warm_up is 0
 FOLLOWING = "motion discovery: following what moves from one time to the next"  # may take a minute
@@ -125,8 +125,7 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
                 f"within {error:.3f} world units" + (f", {bodies} of them as rigid bodies" if bodies else "")
             )
             if found.share >= NEARLY_ALL:
-                of_sheets = min(ALL_TURN, SHEETS / parts**2) if found.sheets else 1.0
-                field_fitted = ALL_TURN if bodies == parts else of_sheets
+                field_fitted = ALL_TURN if bodies == parts else SHEETS if found.sheets else 1.0
     order = morton_order(scene.parameters["means"].detach())
     for name, values in scene.parameters.items():
         scene.parameters[name] = nn.Parameter(values.detach()[order])
