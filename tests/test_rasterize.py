@@ -308,9 +308,11 @@ def test_gradients_flow_on_through_torch(device: Device) -> None:
         ({"colors": torch.zeros(5, 4, 3), "sh_degree": 2}, "colors"),
         ({"colors": torch.zeros(5, 25, 3), "sh_degree": 4}, "sh_degree"),
         ({"background": torch.zeros(4)}, "background"),
+        ({"antialiased": -0.1}, "antialiased"),
+        ({"antialiased": float("nan")}, "antialiased"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_wrong_shapes_are_named(device: Device, changes: dict[str, Any], name: str) -> None:
+def test_wrong_arguments_are_named(device: Device, changes: dict[str, Any], name: str) -> None:
     with pytest.raises(ValueError, match=f"rasterize: {name} must"):
         rasterize(**(random_scene(5, 0) | changes), camera=oblique_camera(9, 9), device=device)

@@ -74,8 +74,10 @@ def rasterize(
         adapter and driver.
 
     Raises:
-        ValueError: shapes do not match.
+        ValueError: shapes do not match, or the variance is negative.
     """
+    if not antialiased >= 0:
+        raise ValueError(f"rasterize: antialiased must be True, False or a variance above 0, px², got {antialiased}")
     check_shapes("rasterize", means, quats, scales, opacities, colors, sh_degree)
     background = means.new_zeros(3) if background is None else background
     if tuple(background.shape) != (3,):
