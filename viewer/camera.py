@@ -5,12 +5,11 @@ from collections.abc import Iterator
 from contextlib import suppress
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from lapgs_wgpu.data.poses import world_to_camera
-from lapgs_wgpu.splat.camera import Camera, rotation_matrix
+from lapgs_wgpu.splat.camera import Array, Camera, rotation_matrix
 
-Vector = NDArray[np.float64]
 _STEEPEST = math.radians(89)  # of the line of sight, up or down: beyond it the picture would turn over
 
 
@@ -23,9 +22,9 @@ class ViewCamera:
 
     def __init__(self, camera: Camera, focus: ArrayLike, up: ArrayLike) -> None:
         """Start where a camera stands; the focus is moved onto its line of sight."""
-        self.position: Vector = camera.position
-        self.focus: Vector = np.asarray(focus, np.float64)
-        self.up: Vector = np.asarray(up, np.float64) / np.linalg.norm(up)
+        self.position: Array = camera.position
+        self.focus: Array = np.asarray(focus, np.float64)
+        self.up: Array = np.asarray(up, np.float64) / np.linalg.norm(up)
         self.near = camera.near
         self.stand_at(camera)
         self._start = (self.position, self.focus, self.rotation, self.fov_y)
@@ -84,7 +83,7 @@ class ViewCamera:
         return Camera(K, world_to_camera(self.rotation.T, self.position), width, height, self.near)
 
 
-def _about(axis: Vector, angle: float) -> NDArray[np.float64]:
+def _about(axis: Array, angle: float) -> Array:
     """(3, 3) rotation by an angle about a unit axis, right-handed."""
     return rotation_matrix([math.cos(0.5 * angle), *(math.sin(0.5 * angle) * axis)])
 

@@ -11,9 +11,7 @@ from numpy.typing import NDArray
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.ply_elements import BAD_SHARE, Floats, open_ply, read_colors
-from lapgs_wgpu.splat.camera import Camera
-
-Array = NDArray[np.float64]
+from lapgs_wgpu.splat.camera import Array, Camera
 
 CAMERA_SAMPLES = 64  # cameras that suffice to determine which points are seen
 DENSITY, MIN_CELLS = 8, 4  # points per cell, on average; cells along an axis
@@ -57,7 +55,7 @@ def read_cloud(path: Path) -> Cloud:
     return cloud
 
 
-def read_points(path: Path) -> tuple[NDArray[np.float64], Floats | None]:
+def read_points(path: Path) -> tuple[Array, Floats | None]:
     """Read positions (N, 3) of a .ply file, and colors (N, 3) in [0, 1], None where it has none that are known.
 
     Positions may be NaN or infinite. Raises InputError if the file is not a point cloud.

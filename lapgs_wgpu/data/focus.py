@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from lapgs_wgpu.data.cloud import Array, in_view
-from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.data.cloud import in_view
+from lapgs_wgpu.splat.camera import Array, Camera
 
 PARALLEL = 1e-2  # mean squared sine between optical axes below which they do not determine a point
 FAR_APART = 30.0  # degrees between neighbouring still cameras, beyond which none confirms another one's depths

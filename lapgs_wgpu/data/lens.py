@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from lapgs_wgpu.data.images import Pixels, Size
 from lapgs_wgpu.errors import InputError
-
-Array = NDArray[np.float64]
+from lapgs_wgpu.splat.camera import Array
 
 MAX_ZOOM = 4.0  # a lens that needs more has wrong coefficients
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from lapgs_wgpu.data.cloud import Cloud
 from lapgs_wgpu.data.focus import focus_of
-from lapgs_wgpu.data.poses import Array, place_of, world_to_camera
-from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.data.poses import place_of, world_to_camera
+from lapgs_wgpu.splat.camera import Array, Camera
 
 BOX = 1.3  # half side of the cube: D-NeRF's scenes lie in it
 TAIL = 1.0  # per cent of the points that may lie outside at either end of each axis: outliers have no influence

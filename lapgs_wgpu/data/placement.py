@@ -12,10 +12,10 @@ from lapgs_wgpu.data.focus import are_parallel, focus_of
 from lapgs_wgpu.data.frames import Capture
 from lapgs_wgpu.data.masks import Mask
 from lapgs_wgpu.data.normalize import BOX, Cube, Normalization, cube_in_view, cube_of_points
-from lapgs_wgpu.data.poses import AXES_HINT, Array
+from lapgs_wgpu.data.poses import AXES_HINT
 from lapgs_wgpu.data.views import View
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.camera import Array, Camera
 
 CUBE_POINTS = 4096  # random points that determine the cube of a capture without a cloud
 MIN_CLOUD_POINTS = 4096  # a smaller cloud is filled up: Gaussians multiply too slowly to fill what it leaves empty

@@ -18,11 +18,11 @@ from PIL import Image
 from scipy import ndimage, sparse
 from scipy.sparse.linalg import spsolve
 
-from lapgs_wgpu.data.cloud import Array, points_at
+from lapgs_wgpu.data.cloud import points_at
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.views import Dataset, small_views
 from lapgs_wgpu.progress import counted, say
-from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.camera import Array, Camera
 
 Floats = NDArray[np.float32]
 

@@ -3,13 +3,10 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lapgs_wgpu.data.json_fields import Fields
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.splat.camera import rotation_matrix
-
-Array = NDArray[np.float64]
+from lapgs_wgpu.splat.camera import Array, rotation_matrix
 
 # Largest deviation of R^T R from the identity: files store about seven digits; scale or shear exceeds this by far.
 ROTATION_TOLERANCE = 1e-3

@@ -18,13 +18,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from lapgs_wgpu.data.views import Dataset, View
 from lapgs_wgpu.errors import InputError
-from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.camera import Array, Camera
 from lapgs_wgpu.train.config import CamerasConfig
 from lapgs_wgpu.train.optimizer import rate_at
 
@@ -32,7 +31,6 @@ MEAN_DECAY = 0.5  # of a camera's momentum: it is seen a few dozen times
 SQUARE_DECAY = 0.98  # of the second moment, which all cameras share
 MOST_POINTS = 2000  # of the scene that the image motion is measured at
 NEAREST = 0.05  # depth relative to the median of the points, below which a point does not count
-Array = NDArray[np.float64]
 
 
 class ScenePoints(NamedTuple):

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from lapgs_wgpu.data.cloud import Array, Cloud, find_cloud, points_at, read_cloud, read_npy
+from lapgs_wgpu.data.cloud import Cloud, find_cloud, points_at, read_cloud, read_npy
 from lapgs_wgpu.data.evenly import evenly
 from lapgs_wgpu.data.frames import Capture, Frame, Reader, Split
 from lapgs_wgpu.data.images import SUFFIXES, ImageFile, check_image, decode, decode_gray, size_text
@@ -23,7 +23,7 @@ from lapgs_wgpu.data.stamps import ImageName, natural_key
 from lapgs_wgpu.data.video_frames import unpacked
 from lapgs_wgpu.errors import InputError
 from lapgs_wgpu.io.listing import listed
-from lapgs_wgpu.splat.camera import Camera
+from lapgs_wgpu.splat.camera import Array, Camera
 
 POSES = "poses_bounds.npy"
 CAMERA = re.compile(r"cam(\d{1,4})")
