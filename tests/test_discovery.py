@@ -225,12 +225,29 @@ def test_equal_things_keep_their_own_trajectories_through_gaps_between_the_image
     keep_their_own(*(each.positions(t) for each in moving_objects(MotionScene(path=2, cycles=1))[:2]), t)
 
 
+def test_equal_things_keep_their_own_trajectories_where_some_of_their_images_show_them_elsewhere() -> None:
+    t, rng = np.linspace(0, 1, 120), np.random.default_rng(4)
+    swing = 0.7 * np.cos(4 * np.pi * t)
+    paths = np.stack([swing, 0 * t, 0.23 + 0 * t], axis=1), np.stack([0 * t, swing, -0.23 + 0 * t], axis=1)
+    strays = [
+        np.where(rng.random((120, 1)) < 0.15, *(rng.normal(size=(120, 3)) * s for s in (0.3, 0.06))) for _ in paths
+    ]
+    found = find_trajectories(grey(t, *(path + stray for path, stray in zip(paths, strays, strict=True))))[0]
+    for center in paths:
+        assert min(np.quantile(np.linalg.norm(each.centers - center, axis=1), 0.95) for each in found) < RADIUS
+
+
 def keep_their_own(one: np.ndarray, other: np.ndarray, times: np.ndarray) -> None:
-    grey = tuple(cloud._replace(colors=0 * cloud.colors + 0.5) for cloud in balls(one, other).clouds)
-    found = find_trajectories(PointClouds(times, grey, BOX))[0]
+    found = find_trajectories(grey(times, one, other))[0]
     assert len(found) == 2
     for center in (one, other):
         assert min(np.linalg.norm(each.centers - center, axis=1).max() for each in found) < 1.5 * RADIUS
+
+
+def grey(times: np.ndarray, *centers: np.ndarray) -> PointClouds:
+    """Clouds of equal balls on paths (T, 3)."""
+    clouds = tuple(cloud._replace(colors=0 * cloud.colors + 0.5) for cloud in balls(*centers).clouds)
+    return PointClouds(times, clouds, BOX)
 
 
 def test_patches_that_come_and_go_are_not_followed() -> None:

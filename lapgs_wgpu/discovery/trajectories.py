@@ -33,7 +33,8 @@ BEND = 0.3  # standard deviation of a group's center around the straight continu
 STEP = 0.7  # from one time to the next, at most
 REACHES = 0.5, 0.25, 0.12  # within twice this a path may be given a group, in rounds
 MEETING = 0.6  # paths that meet come so near
-MEET_TIMES, MEET_GAP = 6, 2  # times before and after a meeting that tell who is who; those around it that do not
+MEET_TIMES, MEET_GAP = 10, 2  # times before and after a meeting that tell who is who; those around it that do not
+STRAYS = 0.05  # distance of a group from its path, beyond which it says less there
 
 
 class Trajectory(NamedTuple):
@@ -166,13 +167,17 @@ def _uncross(groups: _Groups, paths: list[list[int]]) -> None:
 
 
 def _bend(groups: _Groups, at: int, before: list[int], after: list[int]) -> float:
-    """Squared distances from a parabola of the groups of a path at the times shortly before and after one."""
+    """How far groups of a path shortly before and after a time are from a parabola: Cauchy's loss, since some stray."""
     around = [g for g in before + after if MEET_GAP < abs(groups.time[g] - at) <= MEET_GAP + MEET_TIMES]
     if len(around) < 6:
         return 0.0
     basis = np.vander((groups.clock[groups.time[around]] - groups.clock[at]) / MEET_TIMES, 3)
-    fitted = basis @ np.linalg.lstsq(basis, groups.centers[around], rcond=None)[0]
-    return float(np.square(groups.centers[around] - fitted).sum())
+    centers, weights = groups.centers[around], np.ones((len(around), 1))
+    for _ in range(8):
+        parabola = np.linalg.lstsq(weights * basis, weights * centers, rcond=None)[0]
+        away = np.linalg.norm(centers - basis @ parabola, axis=1) / (STRAYS * groups.half_side)
+        weights = 1 / np.sqrt(1 + away[:, None] ** 2)
+    return float(np.log1p(away**2).sum())
 
 
 def _change(groups: _Groups, before: list[int], after: list[int]) -> float:
