@@ -41,7 +41,7 @@ from lapgs_wgpu.train.trainer import Trainer
 
 DYNAMICS = 0.5  # standard deviation of the dynamics attribute of a discovered Gaussian, which it shares with its part
 NEARLY_ALL = 0.8  # share of the surface points that tracks explain, above which the field has little left to learn
-ALL_TURN = 0.1  # of the field's highest rates, where all that moves turns: it forgets turns sooner than places
+ALL_TURN = 0.03  # of the field's highest rates, where all that moves turns: it forgets turns sooner than places
 SHEETS = 0.01  # the same of sheets, of which few images show each
 FIT_STEPS_PER_TIME = 30  # of `fit_field` on a rig, at least: what flies fast is lost by fewer
 RAMP_STEPS = 200  # over which learning rates rise after discovery, where schedule.warm_up is 0
