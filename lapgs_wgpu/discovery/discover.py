@@ -40,7 +40,8 @@ from lapgs_wgpu.train.setup import Start, set_up, start_from_points
 from lapgs_wgpu.train.trainer import Trainer
 
 DYNAMICS = 0.5  # standard deviation of the dynamics attribute of a discovered Gaussian, which it shares with its part
-NEARLY_ALL = 0.8  # share of the surface points that tracks explain, above which the field has little left to learn
+NEARLY_ALL = 0.8  # share of the surface points that tracks explain, above which the field has little left to learn,
+CLOSELY = 0.033  # box half sides; if it then follows them within this
 ALL_TURN = 0.03  # of the field's highest rates, where all that moves turns: it forgets turns sooner than places
 SHEETS = 0.01  # the same of sheets, of which few images show each
 FIT_STEPS_PER_TIME = 30  # of `fit_field` on a rig, at least: what flies fast is lost by fewer
@@ -124,7 +125,7 @@ def discover(config: Config, dataset: Dataset, device: Device, own_field: nn.Mod
                 f"{parts} moving parts with {len(tracks.part)} Gaussians, {found.share:.0%} of what it lacks, followed "
                 f"within {error:.3f} world units" + (f", {bodies} of them as rigid bodies" if bodies else "")
             )
-            if found.share >= NEARLY_ALL:
+            if found.share >= NEARLY_ALL and error < CLOSELY * config.points.box:
                 field_fitted = ALL_TURN if bodies == parts else SHEETS if found.sheets else 1.0
     order = morton_order(scene.parameters["means"].detach())
     for name, values in scene.parameters.items():
