@@ -248,7 +248,7 @@ def _turn_of(look: _Look, expected: Doubles, sums: Doubles) -> Doubles:
     best = expected
     for step, half in AROUND:
         R = Rotation.from_rotvec(np.radians(step) * cubic_grid(np.arange(-half, half + 1.0))).as_matrix() @ best
-        cells = _cells(np.einsum("nj,hjk->hnk", look.places, R), FINE)
+        cells = _cells(look.places @ R, FINE)
         errors = np.square(known[cells] - look.colors).sum(axis=2).mean(axis=1) / variance
         away = np.degrees(Rotation.from_matrix(R @ expected.T).magnitude())
         best = R[int((errors + (away / AS_BEFORE) ** 2).argmin())]
