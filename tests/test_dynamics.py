@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from lapgs_wgpu.train.motion_losses import dynamics_loss, outliers
+from lapgs_wgpu.motion.fields.dynamics import dynamics_loss, outliers
 
 
 def column(values: list[float]) -> Tensor:

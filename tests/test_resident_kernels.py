@@ -15,6 +15,7 @@ from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands, Kernel
 from lapgs_wgpu.gpu.matmul import sum_columns
 from lapgs_wgpu.motion.fields.config import FieldConfig
+from lapgs_wgpu.motion.fields.dynamics import dynamics_loss
 from lapgs_wgpu.motion.fields.laplacian import VARIANCE_FLOOR, VARIANCE_SPREAD, LaplacianMotion
 from lapgs_wgpu.motion.passes.samples import SamplePasses, Samples
 from lapgs_wgpu.splat.camera import Camera
@@ -25,7 +26,6 @@ from lapgs_wgpu.train.camera_refinement import CameraRefinement, scene_points
 from lapgs_wgpu.train.config import CamerasConfig, Rate
 from lapgs_wgpu.train.densify import Statistics
 from lapgs_wgpu.train.exposure import Exposures
-from lapgs_wgpu.train.motion_losses import dynamics_loss
 from lapgs_wgpu.train.optimizer import ADAM_EPS, LARGEST_FREQUENCY_STEP, FrequencyOptimizer
 from lapgs_wgpu.train.resident_corrections import ResidentCorrections
 from lapgs_wgpu.train.resident_parameters import check_finite

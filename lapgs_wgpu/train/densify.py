@@ -19,10 +19,10 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from lapgs_wgpu.errors import InputError
+from lapgs_wgpu.motion.fields.dynamics import outliers
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.rotation import rotation_matrices
 from lapgs_wgpu.train.config import DensityConfig
-from lapgs_wgpu.train.motion_losses import outliers
 
 CHILDREN = 2  # of a split Gaussian
 SPLIT_SIZE = 0.01  # of the cameras' extent; smaller Gaussians are cloned

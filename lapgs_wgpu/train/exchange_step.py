@@ -15,6 +15,7 @@ from lapgs_wgpu.gpu.array import DeviceArray, read_all
 from lapgs_wgpu.gpu.device import Device
 from lapgs_wgpu.gpu.kernel import Commands
 from lapgs_wgpu.motion.fields.deformation import Deformed, Nearby, TimeSamples
+from lapgs_wgpu.motion.fields.dynamics import dynamics_loss
 from lapgs_wgpu.splat.camera import Camera
 from lapgs_wgpu.splat.drawing import camera_gradient
 from lapgs_wgpu.splat.gaussians import Gaussians
@@ -26,7 +27,7 @@ from lapgs_wgpu.train.ground_truth import Draws
 from lapgs_wgpu.train.image_loss import image_loss_of
 from lapgs_wgpu.train.image_metrics import psnr_of
 from lapgs_wgpu.train.learners import Learners
-from lapgs_wgpu.train.motion_losses import acceleration_loss, compared_counts, dynamics_loss, even_times, near_time
+from lapgs_wgpu.train.motion_losses import acceleration_loss, compared_counts, even_times, near_time
 from lapgs_wgpu.train.parts import LossTerm, Regularizer, torch_loss
 from lapgs_wgpu.train.step_result import Measured, Scheduled, Skipped, cause, check_parameters, finite
 

@@ -1,12 +1,9 @@
-"""The losses of motion, smoothness and acceleration: what they compare in a step, and the latter itself; and the loss
-L_dy of the Gaussians' dynamics attributes d, with their outliers (paper eqs. 10 to 12).
+"""The losses of motion, smoothness and acceleration: what they compare in a step, and the latter itself.
 
 Smoothness (of Grid4D; each field computes its own) compares the field's features at nearby places and times.
 Acceleration is how far Gaussians are from where and how large they would be if they moved evenly. A time that one
 camera sees says nothing of how far away things are; its neighbours in time, seen from elsewhere, do. Distances
 saturate, so that what really turns quickly is not held back.
-
-d: (N, D) float32, without a unit. The distance of a Gaussian is that between its row and the mean row.
 """
 
 import torch
@@ -20,7 +17,6 @@ WOBBLE = 1e-2  # world units: distances far below it count as they are, those fa
 EPSILON = 1e-12  # world units squared: keeps the gradient of a distance of 0 finite
 # Largest distance of the two times from the view's, in distances of two images; drawn between half of it and all.
 LARGEST_DISTANCE = 2.0
-ROUNDING = 1e-6  # tolerance: distances that are equal except for rounding are no outliers
 
 
 def compared_counts(
@@ -68,24 +64,3 @@ def robust_length(vectors: Tensor) -> Tensor:
     """The mean over vectors (M, 3) of c l / (l + c), l the length and c = WOBBLE."""
     lengths = (vectors.square().sum(dim=1) + EPSILON).sqrt()
     return (WOBBLE * lengths / (lengths + WOBBLE)).mean()
-
-
-def outliers(d: Tensor) -> Tensor:
-    """Return a mask (N,) of the rows whose distance exceeds the mean distance by a standard deviation (eqs. 10, 11).
-
-    The standard deviation of the N distances is divided by N, not by N - 1. If all rows are equal, none is an outlier.
-    """
-    distances = _offsets(d.detach()).norm(dim=1).double()
-    mean = distances.mean()
-    deviation = (distances - mean).square().mean().sqrt()
-    return distances > (1 + ROUNDING) * mean + deviation
-
-
-def dynamics_loss(d: Tensor) -> Tensor:
-    """L_dy (eq. 12), a scalar: the sum of the outliers' squared distances, divided by N. Its descent pulls them to the
-    mean row. The mean row and the choice of the outliers are constants to the gradient."""
-    return (outliers(d) * _offsets(d).square().sum(dim=1)).sum() / max(len(d), 1)
-
-
-def _offsets(d: Tensor) -> Tensor:
-    return d - d.detach().mean(dim=0)

@@ -203,7 +203,7 @@ class ResidentPasses:
         sum_columns(commands, self._pool, values, self._totals, place=TOTALS.index(name), factor=factor)
 
     def _dynamics(self, commands: Commands, rows: DeviceArray, d_rows: DeviceArray) -> None:
-        """Record the loss of the dynamics attributes and its gradient (train/motion_losses)."""
+        """Record the loss of the dynamics attributes and its gradient (motion/fields/dynamics)."""
         n, stride = rows.shape
         sums = ("distance_sums", "square_sums", "losses")
         arrays = {name: self._pool.array(f"dynamics {name}", (_DYNAMICS_GROUPS,)) for name in sums}
