@@ -40,8 +40,8 @@ from lapgs_wgpu.train.setup import Start, set_up, start_from_points
 from lapgs_wgpu.train.trainer import Trainer
 
 DYNAMICS = 0.5  # standard deviation of the dynamics attribute of a discovered Gaussian, which it shares with its part
-NEARLY_ALL = 0.8  # share of the surface points that tracks explain, above which the field has little left to learn,
-CLOSELY = 0.033  # box half sides; if it then follows them within this
+NEARLY_ALL = 0.8  # share of the surface points that tracks explain, from which on the field may have little to learn
+CLOSELY = 0.033  # box half sides; how far it may then be from the tracks, if it has little to learn
 ALL_TURN = 0.03  # of the field's highest rates, where all that moves turns: it forgets turns sooner than places
 SHEETS = 0.01  # the same of sheets, of which few images show each
 FIT_STEPS_PER_TIME = 30  # of `fit_field` on a rig, at least: what flies fast is lost by fewer

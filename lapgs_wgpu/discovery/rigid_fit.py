@@ -13,8 +13,9 @@ from torch import Tensor, nn
 
 from lapgs_wgpu.discovery.residual import Floats, Mask, Residual
 from lapgs_wgpu.discovery.tracks import Tracks, all_of, parabolas
-from lapgs_wgpu.discovery.turns import Doubles, harmonics
+from lapgs_wgpu.discovery.turns import harmonics
 from lapgs_wgpu.gpu.device import Device
+from lapgs_wgpu.splat.camera import Array
 from lapgs_wgpu.splat.linear_light import directions
 from lapgs_wgpu.splat.rasterize import rasterize
 
@@ -30,8 +31,8 @@ SPREADS = {"turns": 4.0, "shifts": 2.0}  # time steps; of the weights by which p
 def rigid_tracks(
     tracks: Tracks,
     stands: NDArray[np.int64],
-    rotations: Mapping[int, Doubles],
-    times: Doubles,
+    rotations: Mapping[int, Array],
+    times: Array,
     images: Sequence[Residual],
     device: Device,
     generator: torch.Generator,
@@ -58,7 +59,7 @@ def rigid_tracks(
 class _Bodies:
     """Gaussians of bodies, one for each given rotation (T, 3, 3), and of other tracks (n,), which stay as they are."""
 
-    def __init__(self, tracks: Tracks, others: Mask, rotations: Mapping[int, Doubles], times: Doubles) -> None:
+    def __init__(self, tracks: Tracks, others: Mask, rotations: Mapping[int, Array], times: Array) -> None:
         parts, self._times = list(rotations), times
         self._radii = torch.tensor([tracks.radius(k) for k in parts])
         self._R = torch.from_numpy(np.stack([rotations[k] for k in parts], axis=1)).float()
@@ -102,7 +103,7 @@ class _Bodies:
         drawn = rasterize(*shapes, values["colors"] * lit, image.camera, antialiased=True, depth=False, device=device)
         return drawn.image + (1 - drawn.alpha)[..., None] * torch.from_numpy(image.still), center
 
-    def fit(self, images: Sequence[Residual], device: Device, generator: torch.Generator) -> Doubles:
+    def fit(self, images: Sequence[Residual], device: Device, generator: torch.Generator) -> Array:
         """Fit them. Returns (2, p): errors of the static fit and of the drawing, where each body is, in the end."""
         optimizer = torch.optim.Adam([{"params": [value], "name": name} for name, value in self._values.items()])
         order: list[int] = []

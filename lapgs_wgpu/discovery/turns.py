@@ -18,8 +18,7 @@ from lapgs_wgpu.data.evenly import evenly_indices
 from lapgs_wgpu.data.timestamps import time_step
 from lapgs_wgpu.discovery.residual import Floats, Residual, cubic_grid
 from lapgs_wgpu.discovery.tracks import Tracks, parabolas
-
-Doubles = NDArray[np.float64]
+from lapgs_wgpu.splat.camera import Array
 
 PIXELS, SAMPLES = 2000, 150  # of an image, and of a part in it, at most
 LEAST_SAMPLES, LEAST_TIMES = 10, 12  # of a part in an image, and at which it is seen
@@ -46,7 +45,7 @@ GAIN = 0.22
 class _Look(NamedTuple):
     """What the images of a time show of a part: unit vectors (n, 3) from its center, and colors (n, 3)."""
 
-    places: Doubles
+    places: Array
     colors: Floats
 
 
@@ -59,9 +58,7 @@ def harmonics(x: Any, y: Any, z: Any) -> list[Any]:
     return [0 * x + 1, x, y, z, x * y, y * z, z * x, x * x - y * y, 3 * z * z - 1]
 
 
-def find_turns(
-    tracks: Tracks, times: Doubles, images: Sequence[Residual]
-) -> tuple[NDArray[np.int64], dict[int, Doubles]]:
+def find_turns(tracks: Tracks, times: Array, images: Sequence[Residual]) -> tuple[NDArray[np.int64], dict[int, Array]]:
     """(p,) which part stands for each, since several may be one thing; and by the number of each of these that turns
     its rotations (T, 3, 3) at the times (T,), from whatever orientation."""
     centers = [tracks.center(k) for k in range(tracks.parts)]
@@ -83,14 +80,15 @@ def find_turns(
         again = [_turn_of(look, each, known - _known(look, each)) for look, each in zip(looks, R, strict=True)]
         R = _smoothed(np.stack(again), clock, near)
         places, colors = _joined(looks)
-        still = _explained(places, colors)
+        variance = _variance(colors)
+        still = _explained(places, colors, variance)
         turned = np.concatenate([look.places @ each for look, each in zip(looks, R, strict=True)])
-        if _explained(turned, colors) - still >= GAIN * (1.0 - still):
+        if _explained(turned, colors, variance) - still >= GAIN * (1.0 - still):
             found[k] = R
     return stands, found
 
 
-def _one_of_each(centers: Sequence[Floats], radii: Doubles) -> NDArray[np.int64]:
+def _one_of_each(centers: Sequence[Floats], radii: Array) -> NDArray[np.int64]:
     """(p,) for each part the one of the same place whose center (T, 3) bends least: what goes astray leaps."""
     stands = np.arange(len(radii))
     bends = [np.square(np.diff(center, 2, axis=0)).sum() for center in centers]
@@ -102,7 +100,7 @@ def _one_of_each(centers: Sequence[Floats], radii: Doubles) -> NDArray[np.int64]
     return stands
 
 
-def _outlined(times: Doubles, centers: Floats, radii: Doubles, images: Sequence[Residual]) -> tuple[Floats, Doubles]:
+def _outlined(times: Array, centers: Floats, radii: Array, images: Sequence[Residual]) -> tuple[Floats, Array]:
     """Centers (T, p, 3) and radii (p,) of parts as the outlines of what moves tell, of those that stand alone and whole
     in an image. Where several images show a time, the last one tells."""
     shifts, weights = np.zeros(centers.shape), np.full(centers.shape[:2], 1e-3)
@@ -130,7 +128,7 @@ def _outlined(times: Doubles, centers: Floats, radii: Doubles, images: Sequence[
     return moved, found
 
 
-def _looks(k: int, times: Doubles, centers: Floats, radii: Doubles, images: Sequence[Residual]) -> list[_Look]:
+def _looks(k: int, times: Array, centers: Floats, radii: Array, images: Sequence[Residual]) -> list[_Look]:
     """What each of the times (T,) shows of part k. centers: (T, p, 3) and radii: (p,) of all parts."""
     found: list[list[_Look]] = [[_Look(np.zeros((0, 3)), np.zeros((0, 3), np.float32))] for _ in times]
     others = np.arange(len(radii)) != k
@@ -162,13 +160,18 @@ def _unlit(looks: list[_Look]) -> list[_Look]:
     return [look._replace(colors=look.colors / each) for look, each in zip(looks, lit, strict=True)]
 
 
-def _cells(places: Doubles, size: float) -> NDArray[np.int64]:
+def _cells(places: Array, size: float) -> NDArray[np.int64]:
     """(...) numbers of the cells of this size, of a cubic grid of SIDE^3, in which places (..., 3) lie."""
     index = np.floor(places / size).astype(np.int64) + SIDE // 2
     return (index[..., 0] * SIDE + index[..., 1]) * SIDE + index[..., 2]
 
 
-def _explained(places: Doubles, colors: Floats, blocks: NDArray[np.int64] | int = 0) -> float:
+def _variance(colors: Floats) -> float:
+    """Of colors (n, 3), over all channels."""
+    return float(colors.var(axis=0).sum())
+
+
+def _explained(places: Array, colors: Floats, variance: float, blocks: NDArray[np.int64] | int = 0) -> float:
     """Share of the variance of colors (n, 3) that places (n, 3) of size CELL explain, as if they were independent.
     blocks: (n,) from 0; only places of one block are compared."""
     cells = _cells(places, CELL) + blocks * SIDE**3
@@ -177,24 +180,26 @@ def _explained(places: Doubles, colors: Floats, blocks: NDArray[np.int64] | int 
     rest = float(np.square(colors).sum())
     for values in colors.T:
         rest -= float((np.bincount(cells, values)[used] ** 2 / counts[used]).sum())
-    return 1.0 - rest / max(len(cells) - len(used), 1) / max(float(colors.var(axis=0).sum()), 1e-9)
+    return 1.0 - rest / max(len(cells) - len(used), 1) / max(variance, 1e-9)
 
 
-def _turn_at(looks: list[_Look], clock: Doubles, key: int) -> tuple[Doubles, float]:
+def _turn_at(looks: list[_Look], clock: Array, key: int) -> tuple[Array, float]:
     """The turn (3,) a time step around a key time, a rotation vector, and how much more of the colors it explains than
     no turn. clock: (T,) time steps, of which eight on either side are looked at."""
     window = [i for i in np.flatnonzero(np.abs(clock - clock[key]) <= 8) if len(looks[i].places)]
     lapses = clock[window] - clock[key]
     places, colors = _joined(looks[i] for i in window)
+    variance = _variance(colors)
     of = np.repeat(np.arange(len(window)), [len(looks[i].places) for i in window])
 
-    def explained(turns: Doubles, reach: int) -> Doubles:
+    def explained(turns: Array, reach: int) -> Array:
         blocks = np.round(lapses / (2 * reach + 1)).astype(np.int64)
         within = lapses - blocks * (2 * reach + 1)
         values = []
         for turn in turns:
             R = Rotation.from_rotvec(within[:, None] * turn).as_matrix()
-            values.append(_explained(np.einsum("ni,nij->nj", places, R[of]), colors, (blocks - blocks.min())[of]))
+            turned = np.einsum("ni,nij->nj", places, R[of])
+            values.append(_explained(turned, colors, variance, (blocks - blocks.min())[of]))
         return np.array(values)
 
     far = FASTEST // SEARCHES[0][0]
@@ -208,7 +213,7 @@ def _turn_at(looks: list[_Look], clock: Doubles, key: int) -> tuple[Doubles, flo
     return best[0], float(values.max() - explained(np.zeros((1, 3)), reach)[0])
 
 
-def _turns(looks: list[_Look], clock: Doubles) -> Doubles:
+def _turns(looks: list[_Look], clock: Array) -> Array:
     """(T, 3, 3) rotations of a part, from the key time at which a turn explains most, which up to five time steps from
     there is kept. clock: (T,) time steps."""
     seen = np.flatnonzero([len(look.places) for look in looks])
@@ -228,7 +233,7 @@ def _turns(looks: list[_Look], clock: Doubles) -> Doubles:
     return R
 
 
-def _known(look: _Look, R: Doubles) -> Doubles:
+def _known(look: _Look, R: Array) -> Array:
     """(4, SIDE, SIDE, SIDE) number of samples, and sums of their colors, that a time of rotation R (3, 3) shows of a
     ball's places of size FINE."""
     cells = _cells(look.places @ R, FINE)
@@ -236,7 +241,7 @@ def _known(look: _Look, R: Doubles) -> Doubles:
     return np.array(sums, np.float64).reshape(4, SIDE, SIDE, SIDE)
 
 
-def _turn_of(look: _Look, expected: Doubles, sums: Doubles) -> Doubles:
+def _turn_of(look: _Look, expected: Array, sums: Array) -> Array:
     """The rotation (3, 3) near the expected one by which a time fits best what others show, as `_known` gives it."""
     if not len(look.places):
         return expected
@@ -244,7 +249,7 @@ def _turn_of(look: _Look, expected: Doubles, sums: Doubles) -> Doubles:
     count, *blurred = (gaussian_filter(each, BLUR, mode="constant", truncate=2.5).ravel() for each in sums)
     unknown = 1e-5 * total
     known = ((np.array(blurred) + unknown * mean[:, None]) / (count + unknown)).T
-    variance = max(float(look.colors.var(axis=0).sum()), 1e-6)
+    variance = max(_variance(look.colors), 1e-6)
     best = expected
     for step, half in AROUND:
         R = Rotation.from_rotvec(np.radians(step) * cubic_grid(np.arange(-half, half + 1.0))).as_matrix() @ best
@@ -255,7 +260,7 @@ def _turn_of(look: _Look, expected: Doubles, sums: Doubles) -> Doubles:
     return best
 
 
-def _smoothed(R: Doubles, clock: Doubles, near: NDArray[np.floating]) -> Doubles:
+def _smoothed(R: Array, clock: Array, near: NDArray[np.floating]) -> Array:
     """Rotations (T, 3, 3) of which each is the mean of those around, by weights (T, T), as they go on from it."""
     steps = Rotation.from_matrix(R[1:] @ np.swapaxes(R[:-1], 1, 2)).as_rotvec() / np.diff(clock)[:, None]
     smooth = np.empty_like(R)
